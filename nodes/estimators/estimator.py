@@ -178,7 +178,7 @@ class Estimator(Node[C], ABC):
     _mounts: Mapping[int, Mount] = MappingProxyType({})
     _frame = ""
     _lost = False
-    _told_unknown = False
+    _warned_unknown = False
     _armed_at: Mapping[str, int] = MappingProxyType({})
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -188,9 +188,9 @@ class Estimator(Node[C], ABC):
             return
         for need in needs if isinstance(needs, Set) else [needs]:
             if need not in _KINDS or needs is need:
-                known = ", ".join(_KINDS)
+                kinds = ", ".join(_KINDS)
                 raise DeclarationError(
-                    f"{cls.__name__}.needs: expected a set of {known}, found {need!r}"
+                    f"{cls.__name__}.needs: expected a set of {kinds}, found {need!r}"
                     + ("" if needs is need else suggest(str(need), _KINDS))
                 )
         cls.needs = frozenset(needs)
@@ -244,9 +244,9 @@ class Estimator(Node[C], ABC):
         before, lidar = choice.cameras, choice.lidar
         choice.announced(announcement)
         if choice.cameras is not before or choice.lidar is not lidar:
-            self._look_at_frames()
+            self._hook_frame_streams()
         if choice.cameras is not before:
-            self._take(choice.cameras)
+            self._use_cameras(choice.cameras)
             self.imu_announcement = None
         if self.imu_announcement is None and choice.imu is not None:
             self.imu_announcement = choice.imu
@@ -254,7 +254,7 @@ class Estimator(Node[C], ABC):
         if choice.lidar is not None and lidar is None:
             self._narrow_to("frames", choice.lidar.source)
 
-    def _take(self, cameras: tuple[CameraAnnouncement, ...]) -> None:
+    def _use_cameras(self, cameras: tuple[CameraAnnouncement, ...]) -> None:
         self.cameras, self._rectification = cameras, None
         if self._choice.rectified:
             self._rectification = Rectification(cameras)
@@ -270,15 +270,15 @@ class Estimator(Node[C], ABC):
         matched = [matcher.stream for matcher in matchers(self).values()]
         return [*matched, *(getattr(self, port) for port in ports)]
 
-    def _look_at_frames(self) -> None:
-        """Have images rectified, and their arrival noted, as they are read."""
+    def _hook_frame_streams(self) -> None:
+        """Rectify images and record their arrival when they are read."""
         for stream in self._frame_streams():
             stream.before, stream.prepare = self._result_queue.wait, self._prepare_frame
 
     async def _prepare_frame(self, frame: F) -> F:
         if self._rectification is not None:
             frame = await self.offload(self._rectification.frame, frame)
-        self._result_queue.arrived(frame)
+        self._result_queue.record_arrival(frame)
         return frame
 
     def _narrow_to(self, port: str, source: str) -> None:
@@ -291,13 +291,13 @@ class Estimator(Node[C], ABC):
                 cameras = Rectification(cameras).cameras if self.config.rectify else cameras
             except ValueError as error:
                 return {cameras[0].source: str(error)}
-        reasons = {camera.source: why for camera in cameras if (why := self.refusal(camera))}
+        reasons = {camera.source: reason for camera in cameras if (reason := self.refusal(camera))}
         if len(cameras) < 2 or reasons or not self.aligned:
             return reasons
-        if (off := misalignment(*cameras)) > ALIGNED:
+        if (error_px := misalignment(*cameras)) > ALIGNED:
             left, right = (camera.source for camera in cameras)
             reasons[right] = (
-                f"expected its rows aligned with those of {left}, found {off:.2g} px off"
+                f"expected its rows aligned with those of {left}, found {error_px:.2g} px off"
             )
         return reasons
 
@@ -307,22 +307,22 @@ class Estimator(Node[C], ABC):
         if camera.info.is_pinhole or model in self.lenses:
             return ""
         coefficients = ", ".join(f"{value:g}" for value in camera.info.distortion)
-        known = f" or with {', '.join(sorted(self.lenses))}" if self.lenses else ""
+        supported = f" or with {', '.join(sorted(self.lenses))}" if self.lenses else ""
         return (
-            f"expected images without distortion{known} (rectify = true makes such of others), "
+            f"expected images without distortion{supported} (rectify = true makes such of others), "
             f"found {model} with {coefficients}"
         )
 
     @on(Armed, TakenOff)
     def vehicle_events(self, event: VehicleEvent) -> None:
-        """Note the first time a vehicle may have left its announced pose."""
+        """Record when each vehicle was first armed: from then on it may move."""
         self._armed_at = {event.source: event.stamp, **self._armed_at}
 
     def check(self) -> Iterable[str]:
         """Return an error if a needed camera or IMU, or in a mere check the library, is missing."""
         library, install = self.library
-        if self.checking and library and (why := why_missing(library)):
-            yield f"{self.method} needs {library} ({why}): {install}"
+        if self.checking and library and (reason := why_missing(library)):
+            yield f"{self.method} needs {library} ({reason}): {install}"
         if missing := self._missing():
             yield missing
         if self._rectification is not None:
@@ -388,8 +388,8 @@ class Estimator(Node[C], ABC):
         """
         stamp = self.exposed_at(image)
         result = self._checked(stamp, result)
-        if not self._result_queue.knows(image) and not self._told_unknown:
-            self._told_unknown = True
+        if not self._result_queue.has_arrival(image) and not self._warned_unknown:
+            self._warned_unknown = True
             self.log.warning(
                 "publish: expected an image read from frames, found one of %s at %.3f s that was "
                 "not: its latency is not kept",
@@ -400,7 +400,7 @@ class Estimator(Node[C], ABC):
             self._send_result(image, stamp, result, origin)
         else:
             send = partial(self._send_result, image, stamp, result.copy(), origin)
-            self._result_queue.put(image, send)
+            self._result_queue.add(image, send)
 
     def send_result(self, image: Event, result: TrackingResult, origin: int | None = None) -> None:
         """Send a tracker's result now, whatever the setting ``latency`` says; see `publish`.
@@ -422,7 +422,7 @@ class Estimator(Node[C], ABC):
         if result.lost:
             self._lose(stamp, result.reason)
             return
-        mount = self._mount_of(result.map, stamp if origin is None else origin)
+        mount = self._mount(result.map, stamp if origin is None else origin)
         if mount.frame_id != self._frame and self._frame:
             reason = f"another map: poses are in {mount.frame_id} from here on"
             if self._lost:
@@ -488,7 +488,7 @@ class Estimator(Node[C], ABC):
         if (mount := self._mounts.get(number)) is not None and len(stamps):
             self.trajectories.send(mount.trajectory(self.clock.now(), self.name, stamps, poses))
 
-    def _mount_of(self, number: int, origin: int) -> Mount:
+    def _mount(self, number: int, origin: int) -> Mount:
         """Return the mount of a map's poses; the first map's poses start at `origin`."""
         if (mount := self._mounts.get(number)) is None:
             first = next(iter(self._mounts.values()), None)

@@ -20,7 +20,7 @@ _REMEMBERED = 1024  # images whose arrival is known, at most
 
 
 class ResultQueue:
-    """Queue of results of images, each sent once its latency is over, in the order of `put`.
+    """Queue of results of images, each sent once its latency is over, in the order of `add`.
 
     Args:
         latency: From the arrival of an image to its result, ns of the clock.
@@ -34,29 +34,29 @@ class ResultQueue:
         self._arrivals: dict[int, int] = {}  # by stamp of the image, ns
         self._waiting: deque[tuple[int, Callable[[], None]]] = deque()
         self._empty = asyncio.Event()
-        self._sends = False
+        self._is_sending = False
 
-    def arrived(self, frame: Any) -> None:
-        """Note the present as the arrival of an image, a scan, or the images of a tuple."""
+    def record_arrival(self, frame: Any) -> None:
+        """Record now as the arrival time of an image, a scan, or the images of a tuple."""
         for event in frame if isinstance(frame, tuple) else (frame,):
             if isinstance(event, Image | DepthImage | LidarScan):
                 self._arrivals[event.stamp] = self._clock.now()
         while len(self._arrivals) > _REMEMBERED:
             del self._arrivals[next(iter(self._arrivals))]
 
-    def knows(self, image: Event) -> bool:
-        """Return whether the arrival of an image is known, or was and is long ago."""
+    def has_arrival(self, image: Event) -> bool:
+        """Return whether an image's arrival is recorded, or may have been and is forgotten."""
         return image.stamp in self._arrivals or len(self._arrivals) == _REMEMBERED
 
     def is_due(self, image: Event) -> bool:
         """Return whether an image's result may go out now: in time, and after those before it."""
         return not self._waiting and self._due(image) <= self._clock.now()
 
-    def put(self, image: Event, send: Callable[[], None]) -> None:
-        """Have a function called when an image's result is due, after those put before."""
+    def add(self, image: Event, send: Callable[[], None]) -> None:
+        """Schedule a call of `send` when an image's result is due, after earlier results."""
         self._waiting.append((self._due(image), send))
-        if not self._sends:
-            self._sends = True
+        if not self._is_sending:
+            self._is_sending = True
             self._start(self._send_all())
 
     def _due(self, image: Event) -> int:
@@ -70,15 +70,15 @@ class ResultQueue:
             await self._empty.wait()
 
     async def _send_all(self) -> None:
-        nothing: concurrent.futures.Future[None] = concurrent.futures.Future()
-        nothing.set_result(None)
+        done: concurrent.futures.Future[None] = concurrent.futures.Future()
+        done.set_result(None)
         try:
             while self._waiting:
                 due, send = self._waiting[0]
                 if due > self._clock.now():  # as the call of a worker that is done already
-                    await self._clock.beside(nothing, due - self._clock.now())
+                    await self._clock.beside(done, due - self._clock.now())
                 self._waiting.popleft()
                 send()
         finally:
-            self._sends = False
+            self._is_sending = False
             self._empty.set()

@@ -31,11 +31,11 @@ def follow_both_ways(
         "criteria": FLOW_CRITERIA,
         "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
     }
-    there, arrived, _ = cv2.calcOpticalFlowPyrLK(
+    forward, arrived, _ = cv2.calcOpticalFlowPyrLK(
         image, other, start, guess.astype(np.float32).reshape(-1, 1, 2), **options
     )
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(other, image, there, start.copy(), **options)
-    miss = np.abs(back - start).reshape(-1, 2).max(axis=1)
-    points = there.reshape(-1, 2).astype(np.float64)
+    backward, returned, _ = cv2.calcOpticalFlowPyrLK(other, image, forward, start.copy(), **options)
+    miss = np.abs(backward - start).reshape(-1, 2).max(axis=1)
+    points = forward.reshape(-1, 2).astype(np.float64)
     good = (arrived.ravel() == 1) & (returned.ravel() == 1) & (miss < _ROUND_TRIP)
     return points, good & inside(points, image.shape, 3)

@@ -105,9 +105,9 @@ class Rectification:
 
     def __init__(self, cameras: Sequence[CameraAnnouncement]) -> None:
         first = cameras[0].info
-        own = [pose_matrix(camera.position, camera.orientation) for camera in cameras]
-        common = own[0][:3, :3] if len(own) == 1 else _common_axes(cameras, own)
-        turns = [matrix[:3, :3].T @ common for matrix in own]
+        poses = [pose_matrix(camera.position, camera.orientation) for camera in cameras]
+        common = poses[0][:3, :3] if len(poses) == 1 else _common_axes(cameras, poses)
+        turns = [matrix[:3, :3].T @ common for matrix in poses]
         info = CameraInfo(
             width=first.width,
             height=first.height,
@@ -132,19 +132,19 @@ class Rectification:
 
         Of a stereo rig the right eye's are those of the field `right`.
         """
-        given: Any = frame
-        made: Any
-        if isinstance(given, Event):
-            right = len(self.cameras) > 1 and given.source.startswith(self.cameras[1].source)
-            made = self.eyes[right].rectify(given)  # type: ignore[arg-type]
+        value: Any = frame
+        rectified: Any
+        if isinstance(value, Event):
+            right = len(self.cameras) > 1 and value.source.startswith(self.cameras[1].source)
+            rectified = self.eyes[right].rectify(value)  # type: ignore[arg-type]
         else:
-            made = type(given)._make(
+            rectified = type(value)._make(
                 self.eyes[name == "right"].rectify(part)
                 if isinstance(part, Image | DepthImage)
                 else part
-                for name, part in zip(given._fields, given, strict=True)
+                for name, part in zip(value._fields, value, strict=True)
             )
-        result: F = made
+        result: F = rectified
         return result
 
 
@@ -165,13 +165,13 @@ def misalignment(left: CameraAnnouncement, right: CameraAnnouncement) -> float:
     return float(off) if np.isfinite(off) else math.inf
 
 
-def _common_axes(cameras: Sequence[CameraAnnouncement], own: Sequence[Floats]) -> Floats:
+def _common_axes(cameras: Sequence[CameraAnnouncement], poses: Sequence[Floats]) -> Floats:
     """Return the common axes (right, down, ahead; columns) of both eyes, shape (3, 3)."""
-    x = own[1][:3, 3] - own[0][:3, 3]
+    x = poses[1][:3, 3] - poses[0][:3, 3]
     length = float(np.linalg.norm(x))
-    ahead = own[0][:3, 2] + own[1][:3, 2]
-    rights = min(float(x @ pose[:3, 0]) for pose in own)
-    if length == 0.0 or rights < 0.5 * length or own[0][:3, 2] @ own[1][:3, 2] < 0.5:
+    ahead = poses[0][:3, 2] + poses[1][:3, 2]
+    rights = min(float(x @ pose[:3, 0]) for pose in poses)
+    if length == 0.0 or rights < 0.5 * length or poses[0][:3, 2] @ poses[1][:3, 2] < 0.5:
         raise ValueError(
             f"expected {cameras[1].source} to the right of {cameras[0].source}, and both to look "
             "the same way, found other poses"

@@ -49,30 +49,30 @@ def describe(image: Grey, pixels: Floats, points: Floats) -> DescribedPoints:
         )
     ]
     descriptors: Any  # there are none if all are near to the edge
-    kept, descriptors = cv2.ORB.create().compute(image, keys)
+    described, descriptors = cv2.ORB.create().compute(image, keys)
     if descriptors is None:
         return DescribedPoints(np.empty((0, 3)), np.empty((0, 32), np.uint8))
-    return DescribedPoints(points[[key.class_id for key in kept]], descriptors)
+    return DescribedPoints(points[[key.class_id for key in described]], descriptors)
 
 
 def relocalize(
     pixels: Floats,  # points of the image, as of `detect_and_describe`, shape (n, 2)
     descriptors: Descriptors,  # theirs, shape (n, 32)
-    known: DescribedPoints,
+    described: DescribedPoints,
     matrix: Floats,  # K, shape (3, 3)
     method: int = cv2.SOLVEPNP_ITERATIVE,  # OpenCV's solver of a pose from points
 ) -> Floats | None:
     """Return an image's pose by known points, world to camera; `None` if not found."""
-    if min(len(pixels), len(known.points)) < _MIN_INLIERS:
+    if min(len(pixels), len(described.points)) < _MIN_INLIERS:
         return None
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
-    matches = matcher.match(known.descriptors, descriptors)
+    matches = matcher.match(described.descriptors, descriptors)
     if len(matches) < _MIN_INLIERS:
         return None
     cv2.setRNGSeed(1)
     inliers: Any  # there are none if nothing was found
     solved, rotation, translation, inliers = cv2.solvePnPRansac(
-        known.points[[match.queryIdx for match in matches]],
+        described.points[[match.queryIdx for match in matches]],
         pixels[[match.trainIdx for match in matches]],
         matrix,
         None,

@@ -60,7 +60,7 @@ class SensorChoice:
         self.imu_port = "imu" if "lidar" in needs else "frames.imu"
         self._imu = named.get(self.imu_port)
         self._refused = refusals
-        self._seen: list[CameraAnnouncement] = []
+        self._cameras: list[CameraAnnouncement] = []
         self._imus: list[ImuAnnouncement] = []
         self._refusals: dict[str, str] = {}
 
@@ -77,26 +77,26 @@ class SensorChoice:
             if isinstance(announcement, LidarAnnouncement) and fits and self.lidar is None:
                 self.lidar = announcement
         elif isinstance(announcement, CameraAnnouncement):
-            self._seen.append(announcement)
+            self._cameras.append(announcement)
             if not self.cameras or self.rectified:
                 self._choose_cameras()
-        if self._inertial and self.imu is None and (beside := self._beside()):
+        if self._inertial and self.imu is None and (beside := self._body_sensor()):
             body = beside.rpartition("/")[0]
             self.imu = next((imu for imu in self._imus if self._fits(imu, body)), None)
 
     def missing(self) -> str:
         """Return a sentence on the missing sensor; empty if none is missing."""
         if "lidar" in self._needs:
-            called = f" called {self._first}" if self._first else ""
-            lacks = "" if self.lidar else f"expected a lidar{called}, found none"
+            suffix = f" called {self._first}" if self._first else ""
+            sentence = "" if self.lidar else f"expected a lidar{suffix}, found none"
         else:
-            lacks = "" if self.cameras else self._no_camera()
-        if not lacks and self._inertial and self.imu is None:
+            sentence = "" if self.cameras else self._no_camera()
+        if not sentence and self._inertial and self.imu is None:
             names = ", ".join(imu.source for imu in self._imus) or "none"
-            return f"expected an IMU beside {self._beside()}, found {names}"
-        return lacks
+            return f"expected an IMU beside {self._body_sensor()}, found {names}"
+        return sentence
 
-    def _beside(self) -> str:
+    def _body_sensor(self) -> str:
         sensor = self.lidar or next(iter(self.cameras), None)
         return sensor.source if sensor else ""
 
@@ -106,7 +106,7 @@ class SensorChoice:
         )
 
     def _choose_cameras(self) -> None:
-        """Choose the first whose images are of use, for the first time or in place of rectified."""
+        """Choose the first usable cameras, those that need no rectification before others."""
         sets = list(self._candidates())
         for rectified in (False, True)[: 1 if self.cameras else 2]:
             for cameras in sets:
@@ -117,15 +117,15 @@ class SensorChoice:
                 self._refusals |= refusals
 
     def _candidates(self) -> Iterator[tuple[CameraAnnouncement, ...]]:
-        for camera in self._seen:
+        for camera in self._cameras:
             right_eye = camera.stereo and camera.source != self._first
-            if right_eye or not self._gives_all(camera, self._first):
+            if right_eye or not self._has_all_images(camera, self._first):
                 continue
             if self._eyes == 1:
                 yield (camera,)
                 continue
-            right = next((c for c in self._seen if self._is_partner(c, camera)), None)
-            if right is not None and self._gives_all(right, right.source):
+            right = next((c for c in self._cameras if self._is_partner(c, camera)), None)
+            if right is not None and self._has_all_images(right, right.source):
                 yield camera, right
 
     def _is_partner(self, camera: CameraAnnouncement, left: CameraAnnouncement) -> bool:
@@ -133,31 +133,31 @@ class SensorChoice:
             return camera.source == self._second
         return camera.stereo == left.source
 
-    def _gives_all(self, camera: CameraAnnouncement, named: str | None) -> bool:
-        """Return whether a camera gives all images; raise `ValueError` if named and lacking."""
+    def _has_all_images(self, camera: CameraAnnouncement, named: str | None) -> bool:
+        """Return whether a camera has all images; raise `ValueError` if named and without them."""
         if named is not None and camera.source != named:
             return False
-        lacking = self._needs - given(camera)
-        if lacking and named is not None:
+        missing = self._needs - image_kinds(camera)
+        if missing and named is not None:
             raise ValueError(
                 f"expected a camera with {', '.join(sorted(self._needs))} images, "
-                f"found none with {', '.join(sorted(lacking))}"
+                f"found none with {', '.join(sorted(missing))}"
             )
-        return not lacking
+        return not missing
 
     def _no_camera(self) -> str:
         if self._refusals:
-            return "; ".join(f"{source}: {why}" for source, why in self._refusals.items())
-        sources = [camera.source for camera in self._seen]
-        called = f" called {self._first}" if self._first else ""
-        what = "camera" if self._eyes == 1 else "stereo rig"
+            return "; ".join(f"{source}: {reason}" for source, reason in self._refusals.items())
+        sources = [camera.source for camera in self._cameras]
+        suffix = f" called {self._first}" if self._first else ""
+        sensor = "camera" if self._eyes == 1 else "stereo rig"
         return (
-            f"expected a {what} with {', '.join(sorted(self._needs))} images{called}, "
+            f"expected a {sensor} with {', '.join(sorted(self._needs))} images{suffix}, "
             f"found {', '.join(sources) or 'none'}{suggest(self._first or '', sources)}"
         )
 
 
-def given(camera: CameraAnnouncement) -> set[str]:
+def image_kinds(camera: CameraAnnouncement) -> set[str]:
     """Return a camera's kinds of image; ``rgb`` serves for ``grey``, too."""
     return {*camera.images} | ({"grey"} if "rgb" in camera.images else set())
 
@@ -261,12 +261,12 @@ def check_result(result: Any) -> str:
         )
     if result.lost:
         return ""
-    given: dict[str, tuple[Any, tuple[int, ...]]] = {"pose": (result.pose, (4, 4))}
-    given |= {"velocity": (result.velocity, (3,))} if result.velocity is not None else {}
-    given |= {"covariance": (result.covariance, (6, 6))} if result.covariance is not None else {}
-    for name, (array, shape) in given.items():
+    arrays: dict[str, tuple[Any, tuple[int, ...]]] = {"pose": (result.pose, (4, 4))}
+    arrays |= {"velocity": (result.velocity, (3,))} if result.velocity is not None else {}
+    arrays |= {"covariance": (result.covariance, (6, 6))} if result.covariance is not None else {}
+    for name, (array, shape) in arrays.items():
         _check_shape(name, array, shape)
-    for name, (array, _) in given.items():
+    for name, (array, _) in arrays.items():
         if not np.isfinite(array).all():
             return f"{name}: expected finite numbers, found {array[~np.isfinite(array)][0]}"
     _check_transform("pose", result.pose)

@@ -62,7 +62,7 @@ class SyntheticOdometry(Node[SyntheticOdometryConfig]):
 
     @on(Odometry)
     def odometry(self, event: Odometry) -> None:
-        """Note the true pose, and the distance flown."""
+        """Record the true pose and the distance flown."""
         if self._truth is None:
             self._start = np.array(event.position)
         else:

@@ -92,7 +92,7 @@ class InertialFilter:
         camera: The optical camera in the IMU's frame, shape (4, 4).
         capacity: Number of remembered key frames.
         common: Shares of variance common to all landmarks in one image, of sightings and of places:
-            many landmarks tell no more than its inverse.
+            many landmarks add up to its inverse at most.
     """
 
     def __init__(
@@ -100,14 +100,14 @@ class InertialFilter:
     ) -> None:
         self._imu, self.camera, self._common = imu, camera, common
         self._capacity = capacity
-        back = inverse(camera)
-        none = np.zeros(3)
-        self.state = State(back[:3, :3], back[:3, 3], none, np.zeros(6), _level(none))
+        in_camera = inverse(camera)
+        zeros = np.zeros(3)
+        self.state = State(in_camera[:3, :3], in_camera[:3, 3], zeros, np.zeros(6), _level(zeros))
         self.covariance = np.zeros((_SIZE, _SIZE))  # of the state's error, shape (17, 17)
         self.forget()
 
     def start(self, force: Floats, pose: Floats | None = None) -> None:
-        """Begin at an image, with gravity against the specific force, if not zero.
+        """Start at an image, with gravity against the specific force, if not zero.
 
         Args:
             force: Mean specific force, m/s², shape (3,).
@@ -118,44 +118,47 @@ class InertialFilter:
         tilt = _TILT if np.linalg.norm(force) > 0 else _NO_TILT
         deviations = np.repeat([_ORIGIN, _ORIGIN, _SPEED, *bias, tilt], 3)[:_SIZE]
         self.covariance = np.diag(np.square(deviations))
-        self._with_frames[:] = 0.0
+        self._cross_covariance[:] = 0.0
         self.state = State(
             body[:3, :3], body[:3, 3], np.zeros(3), np.zeros(6), _level(-body[:3, :3] @ force)
         )
 
     def forget(self) -> None:
-        """Forget all key frames: a new map begins."""
+        """Remove all key frames, for a new map."""
         capacity = _FRAME * (self._capacity + _BESIDE)
         self._frames: dict[int, tuple[Floats, Floats]] = {}
-        self._with_frames = np.zeros((_SIZE, capacity))
-        self._of_frames = np.zeros((capacity, capacity))
+        self._cross_covariance = np.zeros((_SIZE, capacity))
+        self._frame_covariance = np.zeros((capacity, capacity))
 
     def remember(self, number: int, placed: Sighting | None = None, deviation: float = 0.0) -> None:
         """Store the present pose as a key frame's.
 
         Args:
-            number: That of the newest one; or below zero, for an image beside them, kept only if
-                noted again.
+            number: That of the newest one; or below zero, for an image beside them.
             placed: Its new landmarks, with the lasting noise of their places.
             deviation: Standard deviation of an error common to their inverse depths, 1/m.
         """
         at = int(self._slots(np.array([number]))[0])
         self._frames.pop(number - self._capacity, None)
         self._frames[number] = self.state.rotation, self.state.position
-        here, depth = slice(at, at + 6), at + 6
-        self._of_frames[here] = self._with_frames[POSE]
-        self._of_frames[:, here] = self._with_frames[POSE].T
-        self._of_frames[here, here] = self.covariance[POSE, POSE]
-        self._of_frames[depth], self._of_frames[:, depth] = 0.0, 0.0
+        pose, depth = slice(at, at + 6), at + 6
+        self._frame_covariance[pose] = self._cross_covariance[POSE]
+        self._frame_covariance[:, pose] = self._cross_covariance[POSE].T
+        self._frame_covariance[pose, pose] = self.covariance[POSE, POSE]
+        self._frame_covariance[depth], self._frame_covariance[:, depth] = 0.0, 0.0
         if placed is not None and len(placed.places):
             group, numbers = np.zeros(len(placed.places), np.intp), np.array([number])
             equations = self._by_landmarks(self.state, placed, group, numbers)
-            of_pose = np.zeros((6, 6)) if equations is None else equations[0][POSE, POSE]
+            information = np.zeros((6, 6)) if equations is None else equations[0][POSE, POSE]
             shared = 1.0 + self._common[1] * (len(placed.places) - 1)
-            self._of_frames[here, here] += np.linalg.inv(of_pose / shared + np.eye(6) / _VAGUE**2)
-            self._of_frames[depth, depth] = shared / (placed.scale[:, 2] ** 2).sum() + deviation**2
-        self._with_frames[:, here] = self.covariance[:, POSE]
-        self._with_frames[:, depth] = 0.0
+            self._frame_covariance[pose, pose] += np.linalg.inv(
+                information / shared + np.eye(6) / _VAGUE**2
+            )
+            self._frame_covariance[depth, depth] = (
+                shared / (placed.scale[:, 2] ** 2).sum() + deviation**2
+            )
+        self._cross_covariance[:, pose] = self.covariance[:, POSE]
+        self._cross_covariance[:, depth] = 0.0
 
     def propagate(self, motion: Preintegrated) -> None:
         """Propagate the state by an IMU motion, with the present biases."""
@@ -174,7 +177,7 @@ class InertialFilter:
         self.covariance[np.ix_(order, order)] += turn @ motion.covariance @ turn.T
         walk = np.repeat(self._imu.walk**2 * t, 3)
         self.covariance[np.arange(9, 15), np.arange(9, 15)] += walk
-        self._with_frames = change @ self._with_frames
+        self._cross_covariance = change @ self._cross_covariance
         self.state = State(
             state.rotation @ motion.rotation,
             state.position
@@ -186,15 +189,17 @@ class InertialFilter:
             state.level,
         )
 
-    def update(self, seen: Sighting) -> bool:
-        """Take in landmarks of an image; return False, changing nothing, if they contradict."""
-        numbers, group = np.unique(seen.keyframes, return_inverse=True)
-        return self._correct(numbers, lambda state: self._by_landmarks(state, seen, group, numbers))
+    def update(self, sighting: Sighting) -> bool:
+        """Update by the landmarks of an image; return False, changing nothing, if contradictory."""
+        numbers, group = np.unique(sighting.keyframes, return_inverse=True)
+        return self._correct(
+            numbers, lambda state: self._by_landmarks(state, sighting, group, numbers)
+        )
 
-    def misfit(self, seen: Sighting) -> float:
+    def misfit(self, sighting: Sighting) -> float:
         """Return by how much half of the landmarks miss their pixels, in standard deviations."""
-        *_, image = self._image(self.state, seen)
-        return float(np.median(np.hypot(*((seen.measured - image) * seen.scale)[:, :2].T)))
+        *_, image = self._image(self.state, sighting)
+        return float(np.median(np.hypot(*((sighting.measured - image) * sighting.scale)[:, :2].T)))
 
     def update_pose(self, camera: Floats, number: int, information: Floats, first: bool) -> bool:
         """Update by an image's pose from a key frame; return False if contradictory.
@@ -218,12 +223,12 @@ class InertialFilter:
         small = np.zeros((6, 6))
         small[:3, :3], small[:3, 3:] = mounted @ cross_matrix(self.camera[:3, 3]), -camera[:3, :3].T
         small[3:, :3] = -mounted
-        of_body = small.T @ information @ small
+        body_information = small.T @ information @ small
         if first:
-            here = self._slots(np.array([number]))[POSE]
-            lasting = np.linalg.inv(of_body + np.eye(6) / _VAGUE**2)
-            self._of_frames[np.ix_(here, here)] += lasting
-        weighted = by.T @ of_body
+            slots = self._slots(np.array([number]))[POSE]
+            lasting = np.linalg.inv(body_information + np.eye(6) / _VAGUE**2)
+            self._frame_covariance[np.ix_(slots, slots)] += lasting
+        weighted = by.T @ body_information
 
         def measure(state: State) -> tuple[Floats, Floats]:
             turn = Rotation.from_matrix(state.rotation.T @ body[:3, :3]).as_rotvec()
@@ -240,11 +245,11 @@ class InertialFilter:
         """
         slots = self._slots(numbers)
         # Covariances of the poses concerned with themselves, and of the state with these.
-        across = self._with_frames[:, slots]
+        across = self._cross_covariance[:, slots]
         concerned = np.block(
             [
                 [self.covariance[POSE, POSE], across[POSE]],
-                [across[POSE].T, self._of_frames[np.ix_(slots, slots)]],
+                [across[POSE].T, self._frame_covariance[np.ix_(slots, slots)]],
             ]
         )
         state_with = np.hstack([self.covariance[:, POSE], across])
@@ -258,49 +263,49 @@ class InertialFilter:
             by_pose = information[POSE]
             spread = by_pose @ concerned @ by_pose.T + by_pose[:, POSE]
             spread += _FLOOR**2 * by_pose[:, POSE] @ by_pose[:, POSE]
-            off = vector[POSE] @ np.linalg.pinv(spread, 1e-12, hermitian=True) @ vector[POSE]
-            if not off < _IMPLAUSIBLE:
+            distance = vector[POSE] @ np.linalg.pinv(spread, 1e-12, hermitian=True) @ vector[POSE]
+            if not distance < _IMPLAUSIBLE:
                 return False
-            both = np.column_stack([vector, information])
-            solved = np.linalg.solve(np.eye(len(vector)) + information @ concerned, both)
+            right_side = np.column_stack([vector, information])
+            solved = np.linalg.solve(np.eye(len(vector)) + information @ concerned, right_side)
             error = state_with @ solved[:, 0]
             state = self.state.moved(error)
         self.state = state
         gain = state_with @ ((solved[:, 1:] + solved[:, 1:].T) / 2)
-        with_frames = np.vstack([self._with_frames[POSE], self._of_frames[slots]])
+        with_frames = np.vstack([self._cross_covariance[POSE], self._frame_covariance[slots]])
         self.covariance = self.covariance - gain @ state_with.T
-        self._with_frames = self._with_frames - gain @ with_frames
+        self._cross_covariance = self._cross_covariance - gain @ with_frames
         return True
 
     def _slots(self, numbers: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Return where key frames stand, shape (7 n,)."""
+        """Return the rows of key frames in the covariance, shape (7 n,)."""
         place = np.where(numbers < 0, self._capacity - 1 - numbers, numbers % self._capacity)
         return np.asarray((_FRAME * place[:, None] + np.arange(_FRAME)).ravel())
 
     def _by_landmarks(
         self,
         state: State,
-        seen: Sighting,
+        sighting: Sighting,
         group: npt.NDArray[np.intp],
         numbers: npt.NDArray[np.int64],
     ) -> tuple[Floats, Floats] | None:
-        in_body, ahead, image = self._image(state, seen)
+        in_body, ahead, image = self._image(state, sighting)
         if ahead.mean() < _AHEAD:
             return None
         inverse = image[:, 2]
-        residual = (seen.measured - image) * seen.scale
+        residual = (sighting.measured - image) * sighting.scale
         size = np.abs(residual)
         size[:, :2] = np.hypot(residual[:, 0], residual[:, 1])[:, None]
         weight = np.sqrt(huber(size, _HUBER)) * ahead[:, None]
         by_point = np.zeros((len(image), 3, 3))
         by_point[:, 0, 0] = by_point[:, 1, 1] = inverse
         by_point[:, :, 2] = -image * inverse[:, None]
-        by_body = (by_point * (weight * seen.scale)[:, :, None]) @ self.camera[:3, :3].T
+        by_body = (by_point * (weight * sighting.scale)[:, :, None]) @ self.camera[:3, :3].T
         by_world = by_body @ state.rotation.T
         frames = [self._frames[number] for number in numbers.tolist()]
         rotations = np.array([rotation for rotation, _ in frames])[group]
         positions = np.array([position for _, position in frames])[group]
-        arms = np.einsum("nji,nj->ni", rotations, seen.places - positions)
+        arms = np.einsum("nji,nj->ni", rotations, sighting.places - positions)
         by_pose = np.dstack([by_body @ crosses(in_body), -by_world])
         matrix = np.zeros((len(image), 3, len(numbers), _FRAME))
         rows, by_arm = np.arange(len(image)), by_world @ rotations
@@ -308,16 +313,18 @@ class InertialFilter:
         matrix[rows, :, group, 3:6] = by_world
         # A landmark moves along its first ray by its distance, times its depth there.
         ray = arms - self.camera[:3, 3]
-        away = -ray * (ray @ self.camera[:3, 2:3])
-        matrix[rows, :, group, 6] = np.einsum("nij,nj->ni", by_arm, away)
+        derivative = -ray * (ray @ self.camera[:3, 2:3])
+        matrix[rows, :, group, 6] = np.einsum("nij,nj->ni", by_arm, derivative)
         flat = np.concatenate([by_pose, matrix.reshape(len(image), 3, -1)], axis=2)
         flat = flat.reshape(3 * len(image), -1)
         share = 1.0 / (1.0 + self._common[0] * (len(image) - 1))
         return share * (flat.T @ flat), share * (flat.T @ (weight * residual).ravel())
 
-    def _image(self, state: State, seen: Sighting) -> tuple[Floats, npt.NDArray[np.bool_], Floats]:
+    def _image(
+        self, state: State, sighting: Sighting
+    ) -> tuple[Floats, npt.NDArray[np.bool_], Floats]:
         """Return landmarks in the IMU's frame, a mask of those ahead, expected values."""
-        in_body = (seen.places - state.position) @ state.rotation
+        in_body = (sighting.places - state.position) @ state.rotation
         x, y, z = ((in_body - self.camera[:3, 3]) @ self.camera[:3, :3]).T
         ahead = z > 0.05
         inverse = 1.0 / np.where(ahead, z, 1.0)

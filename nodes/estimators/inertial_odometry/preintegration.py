@@ -98,7 +98,7 @@ class ImuModel:
         for dt, turn, half, force in zip(steps, turns, halves, rates[:, 3:], strict=True):
             middle = rotation @ half
             felt = middle @ force
-            # How an error at the start of the step, and one of the rates in it, goes on.
+            # Propagation of an error at the start of the step, and of an error of its rates.
             change = np.eye(9)
             change[:3, :3] = turn.T
             change[3:6, :3] = -rotation @ cross_matrix(half @ force) * dt
@@ -151,13 +151,15 @@ class Rows:
     def image_and_depth(
         self, image: npt.NDArray[np.uint8], depth: Depth
     ) -> tuple[npt.NDArray[np.uint8], Depth]:
-        """Return image and depth (metres, shape (h, w)) as all rows would have shown them."""
-        there = depth[self._at[:, 1], self._at[:, 0]].astype(np.float64)
-        known = there > 0.1
-        inverse = np.where(known, 1.0 / np.where(known, there, 1.0), 0.0)
+        """Return image and depth (metres, shape (h, w)) as taken by a global shutter."""
+        sampled = depth[self._at[:, 1], self._at[:, 0]].astype(np.float64)
+        valid = sampled > 0.1
+        inverse = np.where(valid, 1.0 / np.where(valid, sampled, 1.0), 0.0)
         moved, (columns, rows), nearer = self._moved(image, inverse)
-        held = cv2.remap(depth, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
-        return moved, np.asarray(held / nearer, np.float32)
+        shifted = cv2.remap(
+            depth, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
+        )
+        return moved, np.asarray(shifted / nearer, np.float32)
 
     def _moved(
         self, image: npt.NDArray[np.uint8], inverse: Floats

@@ -88,8 +88,8 @@ class InertialTracker(FeatureTracker):
         self._force = np.zeros(3)
         self._doubt = 0.0  # share of the last images whose landmarks contradict
         self._judged_at = 0.0
-        self._noted = self._referred = _SLOTS[0]
-        self._noted_pose = np.eye(4)
+        self._slot = self._reference_slot = _SLOTS[0]
+        self._slot_pose = np.eye(4)
 
     def fuse(
         self,
@@ -133,7 +133,7 @@ class InertialTracker(FeatureTracker):
 
     @property
     def _is_known(self) -> bool:
-        """Whether velocity and gravity are known well enough to go on without images."""
+        """Return whether velocity and gravity are known well enough to continue without images."""
         variances = np.diag(self._filter.covariance)
         return not (self._time is None or self._is_doubted) and bool(
             variances[V].max() < _KNOWN[0] ** 2 and variances[G].max() < _KNOWN[1] ** 2
@@ -146,13 +146,13 @@ class InertialTracker(FeatureTracker):
             newest = np.maximum.accumulate(samples[:, 0])
             samples = samples[np.concatenate([[True], np.diff(newest) > 0])]
         else:
-            rest = -self._filter.state.gravity @ self._filter.state.rotation
-            samples = np.array([[now, 0.0, 0.0, 0.0, *rest]])
-        begin = now if self._time is None else self._time
-        inner = samples[(samples[:, 0] > begin) & (samples[:, 0] < now), 0]
-        times = np.concatenate([[begin], inner, [now]])
+            specific_force = -self._filter.state.gravity @ self._filter.state.rotation
+            samples = np.array([[now, 0.0, 0.0, 0.0, *specific_force]])
+        start = now if self._time is None else self._time
+        inner = samples[(samples[:, 0] > start) & (samples[:, 0] < now), 0]
+        times = np.concatenate([[start], inner, [now]])
         rows = self._imu.at(samples, times)
-        if now > begin:
+        if now > start:
             self._filter.propagate(self._imu.preintegrate(rows, self._filter.state.bias))
             self._time = now
         used = int(np.searchsorted(samples[:, 0], now)) - 1
@@ -172,8 +172,8 @@ class InertialTracker(FeatureTracker):
         moved[:3, :3] = -state.rotation @ cross_matrix(camera[:3, 3])
         moved[:3, 3:], moved[3:, :3] = np.eye(3), state.rotation
         covariance: Floats = moved @ self._filter.covariance[POSE, POSE] @ moved.T
-        way = self._scale * self._camera_pose()[:3, 3]
-        covariance[:3, :3] += np.outer(way, way)
+        scale_error = self._scale * self._camera_pose()[:3, 3]
+        covariance[:3, :3] += np.outer(scale_error, scale_error)
         return (covariance + covariance.T) / 2
 
     def _straightened(
@@ -187,7 +187,7 @@ class InertialTracker(FeatureTracker):
             return rows.image_and_depth(image, np.asarray(other, np.float32))
         return rows.image(image), rows.image(np.asarray(other, np.uint8))
 
-    # What the map's tracker asks for.
+    # Overrides of the map's tracker.
 
     def _expect(self, grey: Grey) -> Floats | None:
         """Return the IMU's predicted pose, world to camera, once the filter is sure."""
@@ -197,21 +197,21 @@ class InertialTracker(FeatureTracker):
         return ([self._pose], False) if self._is_known else super()._starts(stamp, match)
 
     def _find(
-        self, grey: Grey, inverse_of: Depth, expected: Floats, information: Floats | None = None
+        self, grey: Grey, inverse_depths: Depth, expected: Floats, information: Floats | None = None
     ) -> MapMatch | None:
         """Find the map; where nothing is aligned, few landmarks suffice beside the IMU."""
         if not self._aligns and information is None and self._is_known:
             information = None if self._lost_since else _PREDICTED
-        return super()._find(grey, inverse_of, expected, information)
+        return super()._find(grey, inverse_depths, expected, information)
 
-    def _match(self, grey: Grey, inverse_of: Depth) -> MapMatch | None:
-        """Find the map in an image, and let the landmarks found correct the filter."""
-        match = super()._match(grey, inverse_of)
+    def _match(self, grey: Grey, inverse_depths: Depth) -> MapMatch | None:
+        """Find the map in an image, and correct the filter by the landmarks."""
+        match = super()._match(grey, inverse_depths)
         if match is not None:
-            seen = self._sighting(match, inverse_of)
-            agrees = self._filter.update(seen)
-            if len(seen.places) >= self._enough:  # fewer may all be wrong
-                self._judge(agrees and self._filter.misfit(seen) < _MISFIT)
+            sighting = self._sighting(match, inverse_depths)
+            agrees = self._filter.update(sighting)
+            if len(sighting.places) >= self._enough:  # fewer may all be wrong
+                self._judge(agrees and self._filter.misfit(sighting) < _MISFIT)
             match = match if agrees else None
         return None if self._is_doubted else self._corrected(match)
 
@@ -227,16 +227,16 @@ class InertialTracker(FeatureTracker):
     def _aligned(
         self,
         grey: Grey,  # noqa: ARG002
-        inverse_of: Depth,  # noqa: ARG002
+        inverse_depths: Depth,  # noqa: ARG002
         alignment: Alignment,
         match: MapMatch | None,
     ) -> MapMatch | None:
         if self._is_doubted:
             return None
-        if first := bool((alignment.reference == self._noted_pose).all()):
-            self._referred = self._noted
+        if first := bool((alignment.reference == self._slot_pose).all()):
+            self._reference_slot = self._slot
         believed, pose = BELIEVED * alignment.information, inverse(alignment.pose)
-        if self._filter.update_pose(pose, self._referred, believed, first):
+        if self._filter.update_pose(pose, self._reference_slot, believed, first):
             match = match or MapMatch.without_landmarks(alignment.pose)
         return self._corrected(match)
 
@@ -247,14 +247,14 @@ class InertialTracker(FeatureTracker):
         self._seen_at = self._now
         return msgspec.structs.replace(match, pose=self._pose)
 
-    def _note(self, grey: Grey, inverse_of: Depth, aligned: bool) -> None:
-        super()._note(grey, inverse_of, aligned)
-        self._noted = _SLOTS[self._referred == _SLOTS[0]]
-        self._noted_pose = self._pose
-        self._filter.remember(self._noted)
+    def _remember_image(self, grey: Grey, inverse_depths: Depth, aligned: bool) -> None:
+        super()._remember_image(grey, inverse_depths, aligned)
+        self._slot = _SLOTS[self._reference_slot == _SLOTS[0]]
+        self._slot_pose = self._pose
+        self._filter.remember(self._slot)
 
-    def _add_keyframe(self, grey: Grey, inverse_of: Depth, rows: Rows, pixels: Floats) -> None:
-        super()._add_keyframe(grey, inverse_of, rows, pixels)
+    def _add_keyframe(self, grey: Grey, inverse_depths: Depth, rows: Rows, pixels: Floats) -> None:
+        super()._add_keyframe(grey, inverse_depths, rows, pixels)
         number = next(reversed(self._keyframes))
         if number == 0:
             self._filter.forget()
@@ -262,26 +262,28 @@ class InertialTracker(FeatureTracker):
                 self._filter.start(self._force, inverse(self._pose))
                 self._time = self._seen_at = self._now
                 self._doubt = 0.0
-            self._note(grey, inverse_of, False)
+            self._remember_image(grey, inverse_depths, False)
         new = np.flatnonzero(self._map.table["keyframe"] == number)
         pixels = self._map.table["pixel"][new]
-        read = self._surfaces_at(inverse_of, pixels, self._settings.depth_noise)
+        read = self._surfaces_at(inverse_depths, pixels, self._settings.depth_noise)
         off = _MISALIGNED / self._matcher.unit if self._matcher is not None else 0.0
-        self._filter.remember(number, self._seen(new, pixels, read, _PLACED), off)
+        self._filter.remember(number, self._make_sighting(new, pixels, read, _PLACED), off)
 
-    def _lose(self, stamp: int, grey: Grey, inverse_of: Depth) -> TrackingResult:
+    def _lose(self, stamp: int, grey: Grey, inverse_depths: Depth) -> TrackingResult:
         """Return a lost result; after a while, start a map at the IMU's pose or in a new frame."""
         result = self._lost(stamp, "too few landmarks of the map were found")
         waited = stamp - (self._lost_since or stamp)
         if waited < self._settings.reset_timeout * 1e9 and not self._is_doubted:
             return result
         if self._is_carried:
-            return self._start_map(stamp, grey, inverse_of, "by a new map, where the IMU says")
-        begun, self._time = self._time, None
-        why = ", as its landmarks contradict the IMU" if self._is_doubted else ""
-        started = self._start_map(stamp, grey, inverse_of, f"by a new map, at a guessed pose{why}")
+            return self._start_map(stamp, grey, inverse_depths, "by a new map, where the IMU says")
+        time, self._time = self._time, None
+        reason = ", as its landmarks contradict the IMU" if self._is_doubted else ""
+        started = self._start_map(
+            stamp, grey, inverse_depths, f"by a new map, at a guessed pose{reason}"
+        )
         if started.lost:
-            self._time = begun
+            self._time = time
         return started
 
     @property
@@ -293,12 +295,12 @@ class InertialTracker(FeatureTracker):
         pose: Floats = transform(state.rotation, state.position) @ self._filter.camera
         return pose
 
-    def _sighting(self, match: MapMatch, inverse_of: Depth) -> Sighting:
+    def _sighting(self, match: MapMatch, inverse_depths: Depth) -> Sighting:
         rows, pixels = match.rows[match.agree], match.pixels[match.agree]
-        read = self._surfaces_at(inverse_of, pixels, self._settings.depth_noise)
-        return self._seen(rows, pixels, read, (1.0, 1.0))
+        read = self._surfaces_at(inverse_depths, pixels, self._settings.depth_noise)
+        return self._make_sighting(rows, pixels, read, (1.0, 1.0))
 
-    def _seen(
+    def _make_sighting(
         self, rows: Rows, pixels: Floats, read: Surfaces, noise: tuple[float, float]
     ) -> Sighting:
         """Return landmarks at pixels, with shares of the noise of a pixel and of its depth."""
@@ -312,8 +314,8 @@ class InertialTracker(FeatureTracker):
         noises = [noise[1] * _READING * self._settings.depth_noise, slant, _BENT * read.inverse]
         variance = sum(np.square(noise_part) for noise_part in noises)
         scale[:, 2] = np.where(read.continuous, 1.0 / np.sqrt(variance), 0.0)
-        these = self._map.table[rows]
-        return Sighting(these["place"], these["keyframe"], measured, scale)
+        landmarks = self._map.table[rows]
+        return Sighting(landmarks["place"], landmarks["keyframe"], measured, scale)
 
 
 class InertialOdometryConfig(EstimatorConfig):

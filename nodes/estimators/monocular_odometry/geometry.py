@@ -166,11 +166,11 @@ def parallax(first: Floats, second: Floats, a: Floats, b: Floats) -> Floats:
 
 def reprojection_errors(pose: Floats, points: Floats, pixels: Floats, matrix: Floats) -> Floats:
     """Return distances (n,) of points (n, 3) from pixels (n, 2); ``inf`` behind the camera."""
-    seen = points @ pose[:3, :3].T + pose[:3, 3]
-    ahead = seen[:, 2] > 1e-6
-    z = np.where(ahead, seen[:, 2], 1.0)
-    x = matrix[0, 0] * seen[:, 0] / z + matrix[0, 2] - pixels[:, 0]
-    y = matrix[1, 1] * seen[:, 1] / z + matrix[1, 2] - pixels[:, 1]
+    in_camera = points @ pose[:3, :3].T + pose[:3, 3]
+    ahead = in_camera[:, 2] > 1e-6
+    z = np.where(ahead, in_camera[:, 2], 1.0)
+    x = matrix[0, 0] * in_camera[:, 0] / z + matrix[0, 2] - pixels[:, 0]
+    y = matrix[1, 1] * in_camera[:, 1] / z + matrix[1, 2] - pixels[:, 1]
     return np.where(ahead & np.isfinite(x) & np.isfinite(y), np.hypot(x, y), np.inf)
 
 
@@ -199,8 +199,12 @@ def hypotheses(first: Floats, second: Floats, matrix: Floats) -> list[Floats]:
     essential: Any
     essential, _ = cv2.findEssentialMat(first, second, matrix, cv2.RANSAC, 0.999, _EPIPOLAR)
     if essential is not None and essential.shape == (3, 3):
-        one, other, shift = cv2.decomposeEssentialMat(essential)
-        motions += [transform(turn, sign * shift) for turn in (one, other) for sign in (1.0, -1.0)]
+        first_turn, second_turn, shift = cv2.decomposeEssentialMat(essential)
+        motions += [
+            transform(turn, sign * shift)
+            for turn in (first_turn, second_turn)
+            for sign in (1.0, -1.0)
+        ]
     return motions
 
 
@@ -218,11 +222,11 @@ SPACING = 12  # pixels between corners
 _QUALITY = 0.005
 
 
-def new_corners(image: Grey, taken: Floats, count: int) -> Floats:
+def new_corners(image: Grey, existing: Floats, count: int) -> Floats:
     """Return up to `count` (at least one) new corners (n, 2) away from those taken (k, 2)."""
     mask = np.zeros_like(image)
     mask[BORDER:-BORDER, BORDER:-BORDER] = 255
-    for column, row in np.rint(taken).astype(int).tolist():
+    for column, row in np.rint(existing).astype(int).tolist():
         cv2.circle(mask, (column, row), SPACING, 0, -1)
     corners: Any = cv2.goodFeaturesToTrack(image, count, _QUALITY, SPACING, mask=mask, blockSize=5)
     return np.empty((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)

@@ -54,12 +54,12 @@ class Initialization:
         if not len(now):
             self._restart(image)
             return None
-        there, good = follow_both_ways(
+        pixels, good = follow_both_ways(
             self._before, image, now, now, self._settings.window, self._settings.levels
         )
         self._before = image
         self._views = [view[good] for view in self._views]
-        newest = there[good]
+        newest = pixels[good]
         if good.sum() < max(self._settings.min_inliers, 0.5 * self._count):
             self._restart(image)
             return None
@@ -99,7 +99,7 @@ class Initialization:
         poses = [np.eye(4), pose]
         views = [first[fits], last[fits]]
         for view in between:
-            poses.append(self._pose_of(points[fits], view[fits]))
+            poses.append(self._solve_pose(points[fits], view[fits]))
             views.append(view[fits])
         count = int(fits.sum())
         adjusted, points, errors = adjust(
@@ -137,12 +137,12 @@ class Initialization:
             return None
         total = float(np.sum(~fits)) * _GOOD**2 * len(self._views)
         for view in self._views[1:]:
-            seen = self._pose_of(points[fits], view[fits])
-            errors = reprojection_errors(seen, points[fits], view[fits], self._matrix)
+            view_pose = self._solve_pose(points[fits], view[fits])
+            errors = reprojection_errors(view_pose, points[fits], view[fits], self._matrix)
             total += float(np.sum(np.minimum(errors, _GOOD) ** 2))
         return total
 
-    def _pose_of(self, points: Floats, pixels: Floats) -> Floats:
+    def _solve_pose(self, points: Floats, pixels: Floats) -> Floats:
         noise = self._settings.pixel_noise
         return solve_pose(points, pixels, np.eye(4), self._matrix, noise)[0]
 
@@ -173,21 +173,21 @@ class Tracks:
         """Mask of corners with a known point in the world, shape (n,)."""
         return np.asarray(np.isfinite(self.points[:, 0]))
 
-    def keep(self, rows: npt.NDArray[np.int64]) -> list[tuple[Floats, dict[int, View]]]:
-        """Keep some; return points and views of those others whose point is known."""
-        kept = np.zeros(len(self), np.bool_)
-        kept[rows] = True
-        gone = np.flatnonzero(~kept & self.known)
-        retired = [(self.points[row], self.views[row]) for row in gone.tolist()]
-        self.drop(np.flatnonzero(~kept))
+    def retain(self, rows: npt.NDArray[np.int64]) -> list[tuple[Floats, dict[int, View]]]:
+        """Drop all other corners; return the points, if known, and views of those dropped."""
+        retained = np.zeros(len(self), np.bool_)
+        retained[rows] = True
+        lost = np.flatnonzero(~retained & self.known)
+        retired = [(self.points[row], self.views[row]) for row in lost.tolist()]
+        self.drop(np.flatnonzero(~retained))
         return retired
 
     def drop(self, rows: npt.NDArray[np.int64]) -> None:
-        """Follow some no longer."""
-        kept = np.ones(len(self), np.bool_)
-        kept[rows] = False
-        self.views = [self.views[row] for row in np.flatnonzero(kept).tolist()]
-        self.pixels, self.points = self.pixels[kept], self.points[kept]
+        """Stop following some corners."""
+        remaining = np.ones(len(self), np.bool_)
+        remaining[rows] = False
+        self.views = [self.views[row] for row in np.flatnonzero(remaining).tolist()]
+        self.pixels, self.points = self.pixels[remaining], self.points[remaining]
 
     def add_view(self, keyframe: int, pixels: Floats) -> None:
         """Add their pixels in a new key frame, shape (n, 2)."""
@@ -196,7 +196,7 @@ class Tracks:
             views[keyframe] = (x, y)
 
     def add(self, pixels: Floats, keyframe: int) -> None:
-        """Begin to follow new corners of a key frame, shape (m, 2)."""
+        """Start following new corners of a key frame, shape (m, 2)."""
         more = Tracks(pixels, keyframe)
         self.pixels = np.concatenate([self.pixels, more.pixels])
         self.points = np.concatenate([self.points, more.points])
@@ -237,9 +237,9 @@ class LocalMap:
         tracks.points = unit * initial.points @ start[:3, :3].T + start[:3, 3]
         tracks.add_view(1, initial.pixels[1])
         before = inverse(start)
-        made = cls(image, [before, second @ before], tracks, matrix, settings)
-        made._add_corners()
-        return made
+        local_map = cls(image, [before, second @ before], tracks, matrix, settings)
+        local_map._add_corners()
+        return local_map
 
     @classmethod
     def around(cls, keyframe: Keyframe, matrix: Floats, settings: MonocularSettings) -> LocalMap:
@@ -280,8 +280,8 @@ class LocalMap:
     def approximate_points(self) -> Floats:
         """Return the points of the corners, shape (n, 3); unknown ones at the median depth."""
         points, pose, unknown = self.tracks.points.copy(), self.pose, ~self.tracks.known
-        seen = self.depth * rays(self.tracks.pixels[unknown], self._matrix)
-        points[unknown] = (seen - pose[:3, 3]) @ pose[:3, :3]
+        in_camera = self.depth * rays(self.tracks.pixels[unknown], self._matrix)
+        points[unknown] = (in_camera - pose[:3, 3]) @ pose[:3, :3]
         return points
 
     def add_keyframe(self, image: Grey, pose: Floats, rows: Indices, pixels: Floats) -> None:
@@ -293,7 +293,7 @@ class LocalMap:
             pixels: Their pixels, shape (n, 2).
         """
         number = self.newest + 1
-        self._past += self.tracks.keep(rows)
+        self._past += self.tracks.retain(rows)
         self._poses[number] = pose
         self.tracks.add_view(number, pixels)
         self.image = image
@@ -303,8 +303,8 @@ class LocalMap:
         self._remove_keyframes()
 
     def _add_corners(self) -> None:
-        wanted = self._settings.corners
-        count = max(wanted - len(self.tracks), wanted // 10)
+        corners = self._settings.corners
+        count = max(corners - len(self.tracks), corners // 10)
         self.tracks.add(new_corners(self.image, self.tracks.pixels, count), self.newest)
 
     def _triangulate(self) -> None:
@@ -314,12 +314,12 @@ class LocalMap:
             by_first.setdefault(min(tracks.views[row]), []).append(row)
         for first, rows in by_first.items():
             before = self._poses[first]
-            there = np.array([tracks.views[row][first] for row in rows])
-            here = tracks.pixels[rows]
-            a, b = rays(there, self._matrix), rays(here, self._matrix)
+            first_pixels = np.array([tracks.views[row][first] for row in rows])
+            last_pixels = tracks.pixels[rows]
+            a, b = rays(first_pixels, self._matrix), rays(last_pixels, self._matrix)
             points = triangulate(before, pose, a, b)
             good = parallax(before, pose, a, b) > self._settings.min_parallax
-            for view, pixels in ((before, there), (pose, here)):
+            for view, pixels in ((before, first_pixels), (pose, last_pixels)):
                 good &= reprojection_errors(view, points, pixels, self._matrix) < _GOOD
             tracks.points[np.array(rows)[good]] = points[good]
 

@@ -46,7 +46,7 @@ class MonocularTracker:
         self._pose = np.eye(4)  # the last known one, world to camera
         self._guess = self._pose  # from which the next pose is computed
         self._before: tuple[Grey, Floats, Floats] | None = None  # image, landmarks, their pixels
-        self._known: deque[Keyframe] = deque(maxlen=_STORED)
+        self._stored: deque[Keyframe] = deque(maxlen=_STORED)
         self._lost_since: int | None = None
         self._maps = 0  # begun at a guessed pose, with a guessed unit
 
@@ -68,8 +68,8 @@ class MonocularTracker:
         self._guess = self._pose
         agree = np.ones(len(rows), np.bool_)
         agree[known] = errors < _AGREES
-        seen = known & agree
-        self._before = grey, tracks.points[rows][seen], pixels[seen]
+        landmarks = known & agree
+        self._before = grey, tracks.points[rows][landmarks], pixels[landmarks]
         result = TrackingResult(
             pose=inverse(self._pose),
             reason=reason,
@@ -80,7 +80,9 @@ class MonocularTracker:
         shift = np.linalg.norm(pixels - tracks.pixels[rows], axis=1)
         far = float(np.median(shift[agree])) > self._settings.keyframe_shift
         overlap = self._settings.keyframe_overlap
-        fewer = agree.sum() < overlap * len(tracks) or seen.sum() < overlap * tracks.known.sum()
+        fewer = (
+            agree.sum() < overlap * len(tracks) or landmarks.sum() < overlap * tracks.known.sum()
+        )
         if far or fewer:
             self._map.add_keyframe(grey, self._pose, rows[agree], pixels[agree])
             self._continue_from(self._map)
@@ -105,7 +107,7 @@ class MonocularTracker:
         start = inverse(self._pose)
         self._map = LocalMap.first(initial, grey, start, unit, self._matrix, self._settings)
         self._lost_since = self._initialization = None
-        self._known.clear()
+        self._stored.clear()
         self._continue_from(self._map)
         count = len(initial.points)
         return TrackingResult(
@@ -120,7 +122,7 @@ class MonocularTracker:
         keyframe = world.keyframe()
         self._pose = self._guess = keyframe.pose
         self._before = keyframe.image, keyframe.landmarks, keyframe.pixels
-        self._known.append(keyframe)
+        self._stored.append(keyframe)
 
     # Every image.
 
@@ -131,22 +133,22 @@ class MonocularTracker:
         image, points, pixels = self._before
         few = slice(None, None, max(len(pixels) // _FEW, 1))
         settings = self._settings
-        there, good = follow_both_ways(
+        followed, good = follow_both_ways(
             image, grey, pixels[few], pixels[few], settings.window, settings.levels
         )
         if 2 * good.sum() < settings.min_inliers:
             return self._guess
-        return self._refine(points[few][good], there[good], self._guess)[0]
+        return self._refine(points[few][good], followed[good], self._guess)[0]
 
     def _follow(self, grey: Grey, world: LocalMap, expected: Floats) -> tuple[Indices, Floats]:
         """Follow the newest key frame's corners; return found rows and their pixels."""
         points = world.approximate_points()
         window = self._settings.window
         fx, fy, cx, cy = intrinsics(self._matrix)
-        seen = points @ expected[:3, :3].T + expected[:3, 3]
-        z = np.maximum(seen[:, 2], 1e-6)
-        guess = np.stack([fx * seen[:, 0] / z + cx, fy * seen[:, 1] / z + cy], axis=1)
-        visible = (seen[:, 2] > 1e-3 * world.depth) & inside(guess, grey.shape, window // 2)
+        in_camera = points @ expected[:3, :3].T + expected[:3, 3]
+        z = np.maximum(in_camera[:, 2], 1e-6)
+        guess = np.stack([fx * in_camera[:, 0] / z + cx, fy * in_camera[:, 1] / z + cy], axis=1)
+        visible = (in_camera[:, 2] > 1e-3 * world.depth) & inside(guess, grey.shape, window // 2)
         rows = np.flatnonzero(visible)
         if not len(rows):
             return rows, np.empty((0, 2))
@@ -179,10 +181,10 @@ class MonocularTracker:
             self._lost_since = stamp
         self._before = None
         corners, descriptors = detect_and_describe(grey, _ORB_POINTS)
-        for keyframe in reversed(self._known):
-            known = describe(keyframe.image, keyframe.pixels, keyframe.landmarks)
-            pose = relocalize(corners, descriptors, known, self._matrix)
-            if pose is not None:  # tracking goes on from there with the next image
+        for keyframe in reversed(self._stored):
+            described = describe(keyframe.image, keyframe.pixels, keyframe.landmarks)
+            pose = relocalize(corners, descriptors, described, self._matrix)
+            if pose is not None:  # the next image is tracked from this pose
                 self._map = LocalMap.around(keyframe, self._matrix, self._settings)
                 self._guess = pose
                 break

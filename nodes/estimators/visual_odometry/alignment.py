@@ -46,16 +46,16 @@ class View(msgspec.Struct, frozen=True, eq=False):
     """An image made ready to be aligned."""
 
     greys: tuple[Depth, ...]  # grey float32 images, each half as large as the one before
-    inverse_of: Depth  # as of `inverse_depth`, shape (h, w)
+    inverse_depths: Depth  # as of `inverse_depth`, shape (h, w)
     smooth: Depth  # the same, a mean of more pixels
 
     @classmethod
-    def of(cls, grey: Grey, inverse_of: Depth) -> View:
+    def of(cls, grey: Grey, inverse_depths: Depth) -> View:
         """Return the view of an image and its inverse depth."""
         greys = [np.asarray(cv2.GaussianBlur(grey.astype(np.float32), (3, 3), 0.0), np.float32)]
         while len(greys) < _LEVELS and min(greys[-1].shape) >= 64:
             greys.append(np.asarray(cv2.pyrDown(greys[-1]), np.float32))
-        return cls(tuple(greys), inverse_of, np.asarray(cv2.blur(inverse_of, (5, 5))))
+        return cls(tuple(greys), inverse_depths, np.asarray(cv2.blur(inverse_depths, (5, 5))))
 
 
 class Reference(msgspec.Struct, frozen=True, eq=False):
@@ -79,16 +79,16 @@ class Reference(msgspec.Struct, frozen=True, eq=False):
         pixels, nearest = _edges(view)
         edges = (rays(pixels, matrix) / nearest[:, None]).T
         brightness = np.stack([_sample(grey, pixels, n) for n, grey in enumerate(view.greys)])
-        height, width = view.inverse_of.shape
+        height, width = view.inverse_depths.shape
         columns, rows = np.meshgrid(
             np.arange(_SPACING // 2, width, _SPACING), np.arange(_SPACING // 2, height, _SPACING)
         )
         grid = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
-        seen = surfaces_at(view.inverse_of, grid, noise)
-        ray = rays(grid[seen.continuous], matrix)
-        depth = seen.inverse[seen.continuous]
+        surfaces = surfaces_at(view.inverse_depths, grid, noise)
+        ray = rays(grid[surfaces.continuous], matrix)
+        depth = surfaces.inverse[surfaces.continuous]
         fx, fy, *_ = intrinsics(matrix)
-        across = seen.slope[seen.continuous] * (fx, fy)
+        across = surfaces.slope[surfaces.continuous] * (fx, fy)
         constant = depth - (across * ray[:, :2]).sum(axis=1)
         planes = np.column_stack([across, constant]).T
         return cls(pose, edges, brightness, (ray / depth[:, None]).T, planes)
@@ -191,32 +191,34 @@ def _edges(view: View) -> tuple[Floats, Floats]:
     # An outline belongs to what is nearer; its own depth may be of either side, or missing.
     around = np.ones((9, 9), np.uint8)
     at = tuple(pixels.astype(int).T[::-1])
-    nearest = cv2.dilate(view.inverse_of, around)[at].astype(np.float64)
-    farthest = cv2.erode(view.inverse_of, around)[at]
-    own = view.inverse_of[at]
-    depth = np.where(farthest < (1.0 - 2 * _OUTLINE) * nearest, nearest, own)
-    known = np.flatnonzero(depth > 0.02)
-    known = known[:: max(-(-len(known) // _EDGES), 1)]
-    return pixels[known], depth[known]
+    nearest = cv2.dilate(view.inverse_depths, around)[at].astype(np.float64)
+    farthest = cv2.erode(view.inverse_depths, around)[at]
+    own_depth = view.inverse_depths[at]
+    depth = np.where(farthest < (1.0 - 2 * _OUTLINE) * nearest, nearest, own_depth)
+    valid = np.flatnonzero(depth > 0.02)
+    valid = valid[:: max(-(-len(valid) // _EDGES), 1)]
+    return pixels[valid], depth[valid]
 
 
-def _sample(image: Depth, pixels: Floats, level: int, how: int = cv2.INTER_LINEAR) -> Floats:
+def _sample(
+    image: Depth, pixels: Floats, level: int, interpolation: int = cv2.INTER_LINEAR
+) -> Floats:
     """Return an image's values at pixels of the largest size, shape (n,)."""
     if not len(pixels):
         return np.empty(0)
     # OpenCV keeps every second pixel, so a pixel's coordinates are halved.
     x, y = (pixels.T / 2**level).astype(np.float32)
-    samples = cv2.remap(image, x[None], y[None], how, borderMode=cv2.BORDER_REPLICATE)
+    samples = cv2.remap(image, x[None], y[None], interpolation, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(samples, np.float64).ravel()
 
 
 def _project(points: Floats, pose: Floats, matrix: Floats) -> tuple[Floats, Floats]:
     """Return points as x/z, y/z, 1/z in a camera, shape (3, n), and their pixels, shape (n, 2)."""
     fx, fy, cx, cy = intrinsics(matrix)
-    there = pose[:3, :3] @ points + pose[:3, 3:]
-    z = np.maximum(there[2], 0.05)
-    image = np.stack([there[0] / z, there[1] / z, 1.0 / z])
-    image[:2, there[2] < 0.05] = np.inf
+    in_camera = pose[:3, :3] @ points + pose[:3, 3:]
+    z = np.maximum(in_camera[2], 0.05)
+    image = np.stack([in_camera[0] / z, in_camera[1] / z, 1.0 / z])
+    image[:2, in_camera[2] < 0.05] = np.inf
     return image, np.stack([fx * image[0] + cx, fy * image[1] + cy], axis=1)
 
 
@@ -235,19 +237,19 @@ def _brightness(
     reference: Reference, view: View, level: int, pose: Floats, brightness: Floats, matrix: Floats
 ) -> _Residuals:
     image, pixels = _project(reference.edges, pose, matrix)
-    good = np.flatnonzero(inside(pixels, view.inverse_of.shape, 2 * 2**level))
+    good = np.flatnonzero(inside(pixels, view.inverse_depths.shape, 2 * 2**level))
     image, pixels = image[:, good], pixels[good]
-    visible = _sample(view.inverse_of, pixels, 0, cv2.INTER_NEAREST) < _HIDDEN * image[2]
-    apart = 0.5 * 2**level
-    around = np.array([(0, 0), (apart, 0), (-apart, 0), (0, apart), (0, -apart)])
+    visible = _sample(view.inverse_depths, pixels, 0, cv2.INTER_NEAREST) < _HIDDEN * image[2]
+    step = 0.5 * 2**level
+    around = np.array([(0, 0), (step, 0), (-step, 0), (0, step), (0, -step)])
     beside = _sample(view.greys[level], (pixels + around[:, None]).reshape(-1, 2), level)
     value, right, left, below, above = beside.reshape(5, -1)
-    across, down = (right - left) / (2 * apart), (below - above) / (2 * apart)
+    across, down = (right - left) / (2 * step), (below - above) / (2 * step)
     fx, fy, *_ = intrinsics(matrix)
     dx, dy, _ = _motions(image)
-    own = reference.brightness[level][good]
-    residual = value - brightness[0] * own - brightness[1]
-    by = np.concatenate([across * fx * dx + down * fy * dy, [-own, -np.ones(len(own))]])
+    expected = reference.brightness[level][good]
+    residual = value - brightness[0] * expected - brightness[1]
+    by = np.concatenate([across * fx * dx + down * fy * dy, [-expected, -np.ones(len(expected))]])
     spread = 1.4826 * float(np.median(np.abs(residual))) if len(good) else 0.0
     deviation = max(spread, _BRIGHTNESS_NOISE)
     weights = huber(np.abs(residual / deviation), _HUBER) * visible / deviation**2
@@ -261,7 +263,7 @@ def _distances(
 ) -> _Residuals:
     """Return the residuals of inverse depth to the reference's planes."""
     image, pixels = _project(reference.surfaces, pose, matrix)
-    good = np.flatnonzero(inside(pixels, view.inverse_of.shape, _RIM))
+    good = np.flatnonzero(inside(pixels, view.inverse_depths.shape, _RIM))
     image, pixels = image[:, good], pixels[good]
     measured = _sample(view.smooth, pixels, 0)
     planes = pose[:3, :3] @ reference.planes[:, good]

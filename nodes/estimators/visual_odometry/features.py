@@ -137,21 +137,21 @@ class FeatureTracker:
         if self._matcher is not None:
             other = self._matcher.depth(image, np.asarray(other, np.uint8))
         grey, depth = grey_and_depth(self._info, image, np.asarray(other, np.float32))
-        inverse_of = inverse_depth(depth)
+        inverse_depths = inverse_depth(depth)
         self._count += 1
         if not self._keyframes:
             first = "" if self._lost_since is None else "by a first map"
-            return self._start_map(stamp, grey, inverse_of, first)
+            return self._start_map(stamp, grey, inverse_depths, first)
         lost, alignment = self._lost_since is not None, None
-        match = self._match(grey, inverse_of)
+        match = self._match(grey, inverse_depths)
         if self._aligns and (match is None or match.agree.sum() < self._enough):
-            view = View.of(grey, inverse_of)
+            view = View.of(grey, inverse_depths)
             starts, guessed = self._starts(stamp, match)
             alignment = self._references.align(view, starts, guessed)
             if alignment is not None:
-                match = self._aligned(grey, inverse_of, alignment, match)
+                match = self._aligned(grey, inverse_depths, alignment, match)
         if match is None:
-            return self._lose(stamp, grey, inverse_of)
+            return self._lose(stamp, grey, inverse_depths)
         (self._motion.placed if lost else self._motion.measured)(stamp, match.pose)
         self._lost_since = None
         self._pose = match.pose
@@ -160,12 +160,12 @@ class FeatureTracker:
             self._count, rows[agree], np.concatenate([match.missed, rows[~agree]])
         )
         noise = self._settings.depth_noise
-        read = self._surfaces_at(inverse_of, match.pixels[agree], noise)
+        read = self._surfaces_at(inverse_depths, match.pixels[agree], noise)
         self._map.fuse(self._pose, rows[agree], read, _READING * noise)
         if self._matcher is not None:
             self._correct_disparities(self._matcher, match, read)
         self._before = self._reduced(grey), rows[agree], match.pixels[agree]
-        self._note(grey, inverse_of, alignment is not None)
+        self._remember_image(grey, inverse_depths, alignment is not None)
         points, inliers = match.pixels, agree
         if alignment is None:
             far = self._is_far(rows[agree])
@@ -177,7 +177,7 @@ class FeatureTracker:
             if far:
                 self._references.renew(view, self._pose)
         if far:
-            self._add_keyframe(grey, inverse_of, rows[agree], match.pixels[agree])
+            self._add_keyframe(grey, inverse_depths, rows[agree], match.pixels[agree])
         return TrackingResult(
             pose=inverse(self._pose),
             reason="against a key frame" if lost else "",
@@ -197,18 +197,18 @@ class FeatureTracker:
     def _aligned(
         self,
         grey: Grey,
-        inverse_of: Depth,
+        inverse_depths: Depth,
         alignment: Alignment,
         match: MapMatch | None,  # noqa: ARG002
     ) -> MapMatch | None:
         believed = BELIEVED * alignment.information
-        map_match = self._find(grey, inverse_of, alignment.pose, believed)
+        map_match = self._find(grey, inverse_depths, alignment.pose, believed)
         return map_match or MapMatch.without_landmarks(alignment.pose)
 
     def _correct_disparities(self, matcher: StereoMatcher, match: MapMatch, read: Surfaces) -> None:
         """Correct the matcher's disparities, and the depth of all landmarks, by those in view.
 
-        Once for each bit of motion: images from one place tell of noise alone.
+        Once for each bit of motion: images from one place show noise alone.
         """
         field, table, place = matcher.disparities, self._map.table, inverse(self._pose)[:3, 3]
         rows = match.rows[match.agree]
@@ -227,14 +227,14 @@ class FeatureTracker:
         )
         self._map.change_depths(field.terms(table["pixel"]) @ change / matcher.unit)
 
-    def _note(self, grey: Grey, inverse_of: Depth, aligned: bool) -> None:
-        """Remember an image of known pose, and whether known by an alignment."""
-        self._references.note(grey, inverse_of, self._pose, aligned)
+    def _remember_image(self, grey: Grey, inverse_depths: Depth, aligned: bool) -> None:
+        """Store an image of known pose as a reference; `aligned` keeps the present reference."""
+        self._references.remember(grey, inverse_depths, self._pose, aligned)
 
-    def _match(self, grey: Grey, inverse_of: Depth) -> MapMatch | None:
+    def _match(self, grey: Grey, inverse_depths: Depth) -> MapMatch | None:
         """Find the map in an image, from the previous pose or, if lost, by relocalization."""
         expected = self._expect(grey)
-        match = None if expected is None else self._find(grey, inverse_of, expected)
+        match = None if expected is None else self._find(grey, inverse_depths, expected)
         if match is not None or self._lost_since is None:
             return match
         pixels, descriptors = detect_and_describe(grey, ORB_POINTS)
@@ -242,9 +242,9 @@ class FeatureTracker:
             pose = relocalize(pixels, descriptors, frame.points, self._matrix, cv2.SOLVEPNP_AP3P)
             if pose is not None:
                 self._near = None
-                match = self._find(grey, inverse_of, pose)
+                match = self._find(grey, inverse_depths, pose)
                 # Again from there, for the landmarks that were beyond the margin of the search.
-                match = match and self._find(grey, inverse_of, match.pose)
+                match = match and self._find(grey, inverse_depths, match.pose)
                 if match is not None and match.share > _SURE:
                     return match
         self._near = None
@@ -264,7 +264,7 @@ class FeatureTracker:
         few = slice(None, None, max(-(-len(rows) // _FEW), 1))
         rows, pixels = rows[few], pixels[few]
         no_guess: Any = None
-        there, arrived, _ = cv2.calcOpticalFlowPyrLK(
+        followed, arrived, _ = cv2.calcOpticalFlowPyrLK(
             image,
             self._reduced(grey),
             (pixels / self._reduction).astype(np.float32).reshape(-1, 1, 2),
@@ -277,13 +277,13 @@ class FeatureTracker:
         if good.sum() < self._settings.min_inliers:
             return None
         places = self._map.table["place"][rows[good]]
-        there = self._reduction * there.reshape(-1, 2)[good].astype(np.float64)
-        pose, errors = self._solve(places, there, self._pose)
+        followed = self._reduction * followed.reshape(-1, 2)[good].astype(np.float64)
+        pose, errors = self._solve(places, followed, self._pose)
         if (errors < 2 * _AGREES).mean() > 0.6:
             return pose
         cv2.setRNGSeed(1)
         solved, rotation, translation, _ = cv2.solvePnPRansac(
-            places, there, self._matrix, None, flags=cv2.SOLVEPNP_EPNP, reprojectionError=2.0
+            places, followed, self._matrix, None, flags=cv2.SOLVEPNP_EPNP, reprojectionError=2.0
         )
         if not solved:
             return None
@@ -294,7 +294,7 @@ class FeatureTracker:
         return np.asarray(cv2.pyrDown(grey), np.uint8) if self._reduction > 1 else grey
 
     def _find(
-        self, grey: Grey, inverse_of: Depth, expected: Floats, information: Floats | None = None
+        self, grey: Grey, inverse_depths: Depth, expected: Floats, information: Floats | None = None
     ) -> MapMatch | None:
         """Find the map near an expected pose; given its information, few landmarks suffice."""
         settings, landmarks = self._settings, self._map
@@ -306,7 +306,7 @@ class FeatureTracker:
             self._near, self._near_until = near, self._count + _SOON
         rows = landmarks.active(self._count, near)
         rows = landmarks.in_view(expected, size, -half_width(settings.window) - 1.0, rows)
-        rows = landmarks.unhidden(expected, inverse_of, rows, settings.depth_noise)
+        rows = landmarks.unhidden(expected, inverse_depths, rows, settings.depth_noise)
         rows, patches = landmarks.patches(expected, rows)
         # The oldest of each square, as they have the least error.
         _, oldest = np.unique(squares(patches.expected, settings.spacing), return_index=True)
@@ -317,15 +317,15 @@ class FeatureTracker:
         missed, rows, pixels = rows[~matched], rows[matched], pixels[matched]
         if len(rows) < least:
             return None
-        read = self._surfaces_at(inverse_of, pixels, settings.depth_noise)
+        read = self._surfaces_at(inverse_depths, pixels, settings.depth_noise)
         places = landmarks.table["place"][rows]
         start, errors = self._solve(places, pixels, expected, read, information)
         agree = errors < _AGREES
         if agree.sum() < max(least, 0.4 * len(agree)):
             return None
         start = start if information is None else expected
-        seen = places[agree], pixels[agree], start, read.take(agree)
-        pose, _ = self._solve(*seen, information)
+        agreeing = places[agree], pixels[agree], start, read.take(agree)
+        pose, _ = self._solve(*agreeing, information)
         return MapMatch(pose, rows, pixels, agree, missed)
 
     def _solve(
@@ -355,27 +355,27 @@ class FeatureTracker:
         shift = self._info.fx * float(np.linalg.norm(between[:3, 3]) / depth)
         return math.degrees(angle) > settings.keyframe_rotation or shift > settings.keyframe_shift
 
-    def _add_keyframe(self, grey: Grey, inverse_of: Depth, rows: Rows, pixels: Floats) -> None:
+    def _add_keyframe(self, grey: Grey, inverse_depths: Depth, rows: Rows, pixels: Floats) -> None:
         """Store this image, and new landmarks between those found."""
         settings = self._settings
         corners = find_corners(grey, settings.spacing, pixels)
-        seen = self._surfaces_at(inverse_of, corners, settings.depth_noise)
+        surfaces = self._surfaces_at(inverse_depths, corners, settings.depth_noise)
         number = next(reversed(self._keyframes), -1) + 1
         new = self._map.add(
-            number, self._pose, corners[seen.continuous], seen.take(seen.continuous)
+            number, self._pose, corners[surfaces.continuous], surfaces.take(surfaces.continuous)
         )
         rows, pixels = (
             np.concatenate([rows, new]),
-            np.concatenate([pixels, corners[seen.continuous]]),
+            np.concatenate([pixels, corners[surfaces.continuous]]),
         )
         self._keyframes[number] = frame = Keyframe(grey, self._pose)
-        self._newest.append(Described(frame, inverse_of, self._matrix, settings.depth_noise))
+        self._newest.append(Described(frame, inverse_depths, self._matrix, settings.depth_noise))
         self._at_keyframe = len(rows)
         self._near = None
         if len(self._keyframes) > settings.keyframes:
             del self._keyframes[next(iter(self._keyframes))]
-            gone = self._map.forget_before(next(iter(self._keyframes)))
-            pixels, rows = pixels[rows >= gone], rows[rows >= gone] - gone
+            removed = self._map.forget_before(next(iter(self._keyframes)))
+            pixels, rows = pixels[rows >= removed], rows[rows >= removed] - removed
         self._before = self._reduced(grey), rows, pixels
 
     def _images(self) -> dict[int, Grey]:
@@ -390,13 +390,15 @@ class FeatureTracker:
         self._near = None
         self._near_until = 0
 
-    def _start_map(self, stamp: int, grey: Grey, inverse_of: Depth, reason: str) -> TrackingResult:
+    def _start_map(
+        self, stamp: int, grey: Grey, inverse_depths: Depth, reason: str
+    ) -> TrackingResult:
         """Start a new map with a key frame at the present pose, given enough corners."""
         corners = find_corners(grey, self._settings.spacing, np.empty((0, 2)))
-        seen = self._surfaces_at(inverse_of, corners, self._settings.depth_noise)
-        count = int(seen.continuous.sum())
+        surfaces = self._surfaces_at(inverse_depths, corners, self._settings.depth_noise)
+        count = int(surfaces.continuous.sum())
         if count < self._settings.min_inliers:
-            view = View.of(grey, inverse_of)
+            view = View.of(grey, inverse_depths)
             if not (self._aligns and self._references.suffices(view)):
                 least = self._settings.min_inliers
                 few = f"{count} corners with depth, of {least} needed for a map, and too few edges"
@@ -405,8 +407,8 @@ class FeatureTracker:
         self._clear_map()
         self._lost_since = None
         self._motion.placed(stamp, self._pose)
-        self._references.note(grey, inverse_of, self._pose, False)
-        self._add_keyframe(grey, inverse_of, np.empty(0, np.int64), np.empty((0, 2)))
+        self._references.remember(grey, inverse_depths, self._pose, False)
+        self._add_keyframe(grey, inverse_depths, np.empty(0, np.int64), np.empty((0, 2)))
         _, _, pixels = self._before
         return TrackingResult(
             pose=inverse(self._pose),
@@ -418,22 +420,22 @@ class FeatureTracker:
 
     @property
     def _is_carried(self) -> bool:
-        """Whether the pose is known without the map: a new map stays in the frame."""
+        """Return whether the pose is known without the map: a new map stays in the frame."""
         return False
 
-    def _lose(self, stamp: int, grey: Grey, inverse_of: Depth) -> TrackingResult:
+    def _lose(self, stamp: int, grey: Grey, inverse_depths: Depth) -> TrackingResult:
         """Return a lost result; after a while, start a new map at the carried or guessed pose."""
         result = self._lost(stamp, "too few landmarks of the map were found")
         assert self._lost_since is not None
         carried = self._pose
         if self._aligns:
-            view = View.of(grey, inverse_of)
+            view = View.of(grey, inverse_depths)
             carried = self._references.carry(view, self._motion.carried(stamp))
             self._motion.placed(stamp, carried)
         if stamp - self._lost_since < self._settings.reset_timeout * 1e9:
             return result
         self._pose = carried
-        return self._start_map(stamp, grey, inverse_of, "by a new map, at the estimated pose")
+        return self._start_map(stamp, grey, inverse_depths, "by a new map, at the estimated pose")
 
     def _lost(self, stamp: int, reason: str) -> TrackingResult:
         if self._lost_since is None:

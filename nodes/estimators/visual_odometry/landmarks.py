@@ -59,7 +59,7 @@ class Landmarks:
     def __len__(self) -> int:
         return len(self.table)
 
-    def add(self, number: int, pose: Floats, pixels: Floats, seen: Surfaces) -> Rows:
+    def add(self, number: int, pose: Floats, pixels: Floats, surfaces: Surfaces) -> Rows:
         """Add landmarks of a key frame and return their rows.
 
         Args:
@@ -67,24 +67,24 @@ class Landmarks:
             pose: World to camera, shape (4, 4).
             seen: Their surfaces, all continuous.
         """
-        back, new = inverse(pose), np.zeros(len(pixels), _LANDMARK)
+        in_world, new = inverse(pose), np.zeros(len(pixels), _LANDMARK)
         fx, fy, *_ = intrinsics(self._matrix)
         axes = np.zeros((len(new), 3, 3))
         axes[:, 0, 0], axes[:, 1, 1] = 1 / fx, 1 / fy
         axes[:, :, 2] = rays(pixels, self._matrix)
-        directions = back[:3, :3] @ axes
-        new["directions"], new["origin"] = directions, back[:3, 3]
-        new["place"] = back[:3, 3] + directions[:, :, 2] / seen.inverse[:, None]
+        directions = in_world[:3, :3] @ axes
+        new["directions"], new["origin"] = directions, in_world[:3, 3]
+        new["place"] = in_world[:3, 3] + directions[:, :, 2] / surfaces.inverse[:, None]
         new["keyframe"], new["pixel"] = number, pixels
-        new["inverse"], new["slope"], new["readings"] = seen.inverse, seen.slope, 1.0
+        new["inverse"], new["slope"], new["readings"] = surfaces.inverse, surfaces.slope, 1.0
         self.table = np.concatenate([self.table, new])
         return np.arange(len(self) - len(new), len(self))
 
     def forget_before(self, number: int) -> int:
         """Remove landmarks of earlier key frames; return their number."""
-        gone = int(np.searchsorted(self.table["keyframe"], number))
-        self.table = self.table[gone:]
-        return gone
+        removed = int(np.searchsorted(self.table["keyframe"], number))
+        self.table = self.table[removed:]
+        return removed
 
     def in_view(self, pose: Floats, size: tuple[int, int], margin: float, rows: Rows) -> Rows:
         """Return those of some landmarks in an image, or outside by at most `margin`.
@@ -116,9 +116,9 @@ class Landmarks:
         """
         pixels, z = self.project(pose, rows)
         column, row = np.rint(pixels).astype(int).T
-        there = inverse_depth[row, column]
-        off = np.abs(there - 1.0 / z)
-        return np.asarray(rows[(there <= 0) | (off < np.maximum(_HIDES / z, 4 * noise))])
+        measured = inverse_depth[row, column]
+        off = np.abs(measured - 1.0 / z)
+        return np.asarray(rows[(measured <= 0) | (off < np.maximum(_HIDES / z, 4 * noise))])
 
     def active(self, now: int, rows: Rows) -> Rows:
         """Return those of some landmarks to search now, as set by `update_found`."""
@@ -128,13 +128,13 @@ class Landmarks:
         """Return rows whose view is alike enough, and patches, warped by planes' homographies."""
         fx, fy, *_ = intrinsics(self._matrix)
         expected, z = self.project(pose, rows)
-        these = self.table[rows]
-        x = (these["place"] @ pose[:3, :3].T + pose[:3, 3]) / z[:, None]
-        turn = pose[:3, :3] @ these["directions"][:, :, :2]
-        origin = these["origin"] @ pose[:3, :3].T + pose[:3, 3]
+        landmarks = self.table[rows]
+        x = (landmarks["place"] @ pose[:3, :3].T + pose[:3, 3]) / z[:, None]
+        turn = pose[:3, :3] @ landmarks["directions"][:, :, :2]
+        origin = landmarks["origin"] @ pose[:3, :3].T + pose[:3, 3]
         # A neighbour's point, times its inverse depth, is direction + inverse depth × origin.
-        change = turn + origin[:, :, None] * these["slope"][:, None]
-        change /= (these["inverse"] * z)[:, None, None]
+        change = turn + origin[:, :, None] * landmarks["slope"][:, None]
+        change /= (landmarks["inverse"] * z)[:, None, None]
         warps = np.stack(
             [
                 fx * (change[:, 0] - x[:, :1] * change[:, 2]),
@@ -145,8 +145,8 @@ class Landmarks:
         area = np.linalg.det(warps)
         good = (area > _SHRUNK**2) & (area < _GROWN**2)
         good &= np.abs(warps).max(axis=(1, 2)) < _SHEARED
-        these = these[good]
-        patches = Patches(these["keyframe"], these["pixel"], expected[good], warps[good])
+        landmarks = landmarks[good]
+        patches = Patches(landmarks["keyframe"], landmarks["pixel"], expected[good], warps[good])
         return rows[good], patches
 
     def update_found(self, now: int, matched: Rows, missed: Rows) -> None:
@@ -159,21 +159,23 @@ class Landmarks:
         """Move landmarks along their first rays to the mean of all readings (noise in 1/m)."""
         _, z = self.project(pose, rows)
         use = read.continuous & (np.abs(read.inverse - 1.0 / z) < _CONTRADICTS * noise)
-        rows, now = rows[use], read.inverse[use]
+        rows, inverse = rows[use], read.inverse[use]
         origin = self.table["origin"][rows] @ pose[2, :3] + pose[2, 3]
         ahead = self.table["directions"][rows, :, 2] @ pose[2, :3]
-        beyond = 1.0 / now - origin
-        again = ahead / beyond
+        beyond = 1.0 / inverse - origin
+        updated = ahead / beyond
         # By how much the reading's noise grows on its way to the first key frame.
-        gain = again / (beyond * now**2)
+        gain = updated / (beyond * inverse**2)
         use = (beyond > 0.05) & (gain > 0.2)
-        rows, again, weight = rows[use], again[use], 1.0 / gain[use] ** 2
-        these = self.table[rows]
-        total = these["readings"] + weight
-        these["inverse"] += (again - these["inverse"]) * weight / total
-        these["readings"] = np.minimum(total, _MEAN_OF)
-        these["place"] = these["origin"] + these["directions"][:, :, 2] / these["inverse"][:, None]
-        self.table[rows] = these
+        rows, updated, weight = rows[use], updated[use], 1.0 / gain[use] ** 2
+        landmarks = self.table[rows]
+        total = landmarks["readings"] + weight
+        landmarks["inverse"] += (updated - landmarks["inverse"]) * weight / total
+        landmarks["readings"] = np.minimum(total, _MEAN_OF)
+        landmarks["place"] = (
+            landmarks["origin"] + landmarks["directions"][:, :, 2] / landmarks["inverse"][:, None]
+        )
+        self.table[rows] = landmarks
 
     def change_depths(self, changes: Floats) -> None:
         """Change all inverse depths, 1/m, shape (n,), as far as they stay ahead."""
@@ -194,8 +196,8 @@ class MapMatch(msgspec.Struct, frozen=True, eq=False):
     @classmethod
     def without_landmarks(cls, pose: Floats) -> MapMatch:
         """Return a match without landmarks, for a pose known otherwise."""
-        none = np.empty(0, np.int64)
-        return cls(pose, none, np.empty((0, 2)), np.empty(0, np.bool_), none)
+        no_rows = np.empty(0, np.int64)
+        return cls(pose, no_rows, np.empty((0, 2)), np.empty(0, np.bool_), no_rows)
 
     @property
     def share(self) -> float:
@@ -222,20 +224,24 @@ class Described:
         noise: Standard deviation of inverse depth, 1/m.
     """
 
-    def __init__(self, frame: Keyframe, inverse_of: Depth, matrix: Floats, noise: float) -> None:
-        self._source: tuple[Keyframe, Depth] | None = frame, inverse_of
+    def __init__(
+        self, frame: Keyframe, inverse_depths: Depth, matrix: Floats, noise: float
+    ) -> None:
+        self._source: tuple[Keyframe, Depth] | None = frame, inverse_depths
         self._matrix, self._noise = matrix, noise
 
     @functools.cached_property
     def points(self) -> DescribedPoints:
         """The points, in the world."""
         assert self._source is not None
-        (frame, inverse_of), self._source = self._source, None
+        (frame, inverse_depths), self._source = self._source, None
         pixels, descriptors = detect_and_describe(frame.image, ORB_POINTS)
-        seen = surfaces_at(inverse_of, pixels, self._noise)
-        continuous, back = seen.continuous, inverse(frame.pose)
-        points = rays(pixels[continuous], self._matrix) / seen.inverse[continuous, None]
-        return DescribedPoints(points @ back[:3, :3].T + back[:3, 3], descriptors[continuous])
+        surfaces = surfaces_at(inverse_depths, pixels, self._noise)
+        continuous, in_world = surfaces.continuous, inverse(frame.pose)
+        points = rays(pixels[continuous], self._matrix) / surfaces.inverse[continuous, None]
+        return DescribedPoints(
+            points @ in_world[:3, :3].T + in_world[:3, 3], descriptors[continuous]
+        )
 
 
 RIM = 12  # pixels at the edge of the image without corners: patches need a neighbourhood
@@ -253,14 +259,14 @@ def squares(pixels: Floats, spacing: int) -> Floats:
 def find_corners(
     image: Grey,
     spacing: int,  # side of a square, pixels
-    taken: Floats,  # other corners, column and row, shape (m, 2)
+    existing: Floats,  # other corners, column and row, shape (m, 2)
 ) -> Floats:
     """Return corners in empty squares, as whole pixels (column, row), shape (n, 2)."""
     strength = np.asarray(cv2.cornerMinEigenVal(image, _BLOCK))
     height, width = image.shape
     mask = np.zeros((height, width), bool)
     mask[RIM : height - RIM, RIM : width - RIM] = True
-    for column, row in np.rint(taken).astype(int).tolist():
+    for column, row in np.rint(existing).astype(int).tolist():
         mask[
             max(row - _APART, 0) : row + _APART + 1, max(column - _APART, 0) : column + _APART + 1
         ] = 0
@@ -275,7 +281,7 @@ def find_corners(
         axis=1,
     )
     corners = corners[blocks[square, best] > _TEXTURE].astype(np.float64)
-    free = ~np.isin(squares(corners, spacing), squares(taken, spacing))
+    free = ~np.isin(squares(corners, spacing), squares(existing, spacing))
     return np.asarray(corners[free])
 
 
@@ -313,19 +319,19 @@ def find_patches(
     half = half_width(window)
     side = 2 * half + 1
     centre = np.rint(patches.expected)
-    wanted = _cut_warped(patches, images, centre, half)
+    expected = _cut_warped(patches, images, centre, half)
     # One tall image of squares each, so that one call follows them all.
     corner = centre.astype(int) - half
     views = np.lib.stride_tricks.sliding_window_view(image, (side, side))
-    there = np.ascontiguousarray(views[corner[:, 1], corner[:, 0]]).reshape(-1, side)
+    searched = np.ascontiguousarray(views[corner[:, 1], corner[:, 0]]).reshape(-1, side)
     middle = np.stack([np.full(len(centre), half), np.arange(len(centre)) * side + half], axis=1)
     start = middle + patches.expected - centre
-    end, good = follow_both_ways(wanted, there, start, start, window, 0)
+    end, good = follow_both_ways(expected, searched, start, start, window, 0)
     shift = end - start.astype(np.float32)  # which is where the flow starts
     good &= np.abs(shift).max(axis=1) < MARGIN
     inner = slice(half - window // 2, half + window // 2 + 1)
-    wanted = wanted.reshape(-1, side, side)[:, inner, inner]
-    good &= correlation(wanted, around(image, centre + shift, window)) > SAME
+    expected = expected.reshape(-1, side, side)[:, inner, inner]
+    good &= correlation(expected, around(image, centre + shift, window)) > SAME
     return patches.expected + shift, good
 
 
@@ -338,9 +344,11 @@ def around(image: Grey, pixels: Floats, window: int) -> Grey:
     return np.asarray(patches, np.uint8).reshape(-1, window, window)
 
 
-def correlation(one: Grey, other: Grey) -> Floats:
+def correlation(first: Grey, second: Grey) -> Floats:
     """Return how well squares, shape (n, w, w), correlate, shape (n,)."""
-    pair = np.stack([one.reshape(len(one), -1), other.reshape(len(one), -1)]).astype(np.float64)
+    pair = np.stack([first.reshape(len(first), -1), second.reshape(len(first), -1)]).astype(
+        np.float64
+    )
     pair -= pair.mean(axis=2, keepdims=True)
     size = np.sqrt((pair**2).sum(axis=2)).prod(axis=0)
     return np.asarray((pair[0] * pair[1]).sum(axis=1) / np.maximum(size, 1e-9))
@@ -350,19 +358,19 @@ def _cut_warped(patches: Patches, images: Mapping[int, Grey], centre: Floats, ha
     """Return squares around `centre` as expected in the new image, stacked vertically."""
     side = 2 * half + 1
     steps = np.arange(-half, half + 1, dtype=np.float32)
-    back = np.linalg.inv(patches.warps).astype(np.float32)
+    to_source = np.linalg.inv(patches.warps).astype(np.float32)
     offset = (centre - patches.expected).astype(np.float32)
-    # Where in the old image a square's pixel (x, y) lies: pixels + back @ (offset + (x, y)).
-    origin = patches.pixels.astype(np.float32) + (back @ offset[:, :, None])[:, :, 0]
-    across = origin.T[:, :, None] + back[:, :, 0].T[:, :, None] * steps
-    columns, rows = across[:, :, None] + (back[:, :, 1].T[:, :, None] * steps)[..., None]
+    # A square's pixel (x, y) in the old image: pixels + to_source @ (offset + (x, y)).
+    origin = patches.pixels.astype(np.float32) + (to_source @ offset[:, :, None])[:, :, 0]
+    across = origin.T[:, :, None] + to_source[:, :, 0].T[:, :, None] * steps
+    columns, rows = across[:, :, None] + (to_source[:, :, 1].T[:, :, None] * steps)[..., None]
     cut = np.empty((len(centre), side, side), np.uint8)
     for number in np.unique(patches.source).tolist():
-        here = np.flatnonzero(patches.source == number)
-        cut[here] = cv2.remap(
+        members = np.flatnonzero(patches.source == number)
+        cut[members] = cv2.remap(
             images[number],
-            columns[here].reshape(-1, side),
-            rows[here].reshape(-1, side),
+            columns[members].reshape(-1, side),
+            rows[members].reshape(-1, side),
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_REPLICATE,
         ).reshape(-1, side, side)
@@ -385,27 +393,27 @@ class References:
         self._matrix, self._noise = matrix, noise
         self._reference: Reference | None = None
         self._bridge: Reference | None = None
-        self._known: tuple[Grey, Depth, Floats] | None = None
+        self._last: tuple[Grey, Depth, Floats] | None = None
 
-    def note(self, grey: Grey, inverse_of: Depth, pose: Floats, aligned: bool) -> None:
-        """Remember a grey image of known pose; `aligned` keeps the present reference."""
-        self._known, self._bridge = (grey, inverse_of, pose), None
+    def remember(self, grey: Grey, inverse_depths: Depth, pose: Floats, aligned: bool) -> None:
+        """Store a grey image of known pose; `aligned` keeps the present reference."""
+        self._last, self._bridge = (grey, inverse_depths, pose), None
         if not aligned:
             self._reference = None
 
     def renew(self, view: View, pose: Floats) -> None:
         """Make a view the reference; its pose is world to camera, shape (4, 4)."""
-        self._reference = self._made(view, pose)
+        self._reference = self._make_reference(view, pose)
 
     def align(self, view: View, starts: list[Floats], lost: bool) -> Alignment | None:
         """Return a view's alignment with the reference, or the last image, from initial poses."""
         alignment = None
         if self._reference is not None:
             alignment = self._best(self._reference, view, starts, lost)
-        if alignment is None and self._known is not None:
-            grey, inverse_of, pose = self._known
+        if alignment is None and self._last is not None:
+            grey, inverse_depths, pose = self._last
             if self._reference is None or (self._reference.pose != pose).any():
-                self._reference = self._made(View.of(grey, inverse_of), pose)
+                self._reference = self._make_reference(View.of(grey, inverse_depths), pose)
                 alignment = self._best(self._reference, view, starts, lost)
         return alignment
 
@@ -423,15 +431,15 @@ class References:
         )
         pose = expected if alignment is None else alignment.pose
         if alignment is None or alignment.share < _AGREE:
-            self._bridge = self._made(view, pose) if self.suffices(view) else None
+            self._bridge = self._make_reference(view, pose) if self.suffices(view) else None
         return pose
 
     def suffices(self, view: View) -> bool:
         """Return whether a view suffices as a reference of alignments."""
         start = np.eye(4)
-        return self._align(self._made(view, start), view, start, False) is not None
+        return self._align(self._make_reference(view, start), view, start, False) is not None
 
-    def _made(self, view: View, pose: Floats) -> Reference:
+    def _make_reference(self, view: View, pose: Floats) -> Reference:
         return Reference.of(view, pose, self._matrix, self._noise)
 
     def _align(

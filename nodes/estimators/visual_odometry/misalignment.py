@@ -69,7 +69,7 @@ class SmoothField:
         return self._drawn[1]
 
     def update(self, information: Floats, gradient: Floats) -> Floats:
-        """Take in a measurement; return the change of the coefficients.
+        """Update by a measurement; return the change of the coefficients.
 
         Args:
             information: Jᵀ J of its residuals by the coefficients, weighted, shape (6, 6).
@@ -81,7 +81,7 @@ class SmoothField:
         return np.asarray(change)
 
     def measure(self, pixels: Floats, offsets: Floats) -> None:
-        """Take in offsets (n,) measured at pixels (n, 2), some of them wrong."""
+        """Update by offsets (n,) measured at pixels (n, 2), some of them wrong."""
         terms, residuals = self.terms(pixels), self.at(pixels) - offsets
         spread = np.hypot(_ROW_NOISE, self.deviation(pixels))
         weights = _ALIKE / _ROW_NOISE**2 * huber(np.abs(residuals) / spread, _HUBER)
@@ -98,15 +98,15 @@ def disparity_information(
     noise: float,  # standard deviation of inverse depth, 1/m
     matrix: Floats,  # K, shape (3, 3)
 ) -> tuple[Floats, Floats]:
-    """Return what landmarks found again tell of the disparities, for `SmoothField.update`.
+    """Return the disparities' offsets as landmarks show them, for `SmoothField.update`.
 
     Depth at a landmark's first sight and depth now are off, each by the field at its pixel. The
     motion since each key frame is unknown, so it is eliminated (Schur complement): how poses were
     bent by the same error does not matter.
     """
     rows, pixels = match.rows[match.agree], match.pixels[match.agree]
-    these, pose = landmarks.table[rows], match.pose
-    x, y, z = points = pose[:3, :3] @ these["place"].T + pose[:3, 3:]
+    table, pose = landmarks.table[rows], match.pose
+    x, y, z = points = pose[:3, :3] @ table["place"].T + pose[:3, 3:]
     image = np.stack([x / z, y / z, 1.0 / z], axis=1)
     measured = rays(pixels, matrix)
     measured[:, 2] = read.inverse
@@ -120,23 +120,23 @@ def disparity_information(
     by_point = np.zeros((len(rows), 3, 3))
     by_point[:, 0, 0] = by_point[:, 1, 1] = image[:, 2]
     by_point[:, :, 2] = -image * image[:, 2:]
-    moved = -(these["directions"][:, :, 2] @ pose[:3, :3].T) / these["inverse"][:, None] ** 2
-    by_field = (by_point @ moved[:, :, None]) * field.terms(these["pixel"])[:, None]
+    moved = -(table["directions"][:, :, 2] @ pose[:3, :3].T) / table["inverse"][:, None] ** 2
+    by_field = (by_point @ moved[:, :, None]) * field.terms(table["pixel"])[:, None]
     by_field[:, 2] -= field.terms(pixels)
     by_field *= scale[:, :, None] / unit
     by_pose = np.concatenate([by_point, -by_point @ crosses(points.T)], axis=2) * scale[:, :, None]
     size = np.abs(residuals)
     size[:, :2] = np.hypot(residuals[:, 0], residuals[:, 1])[:, None]
     root = np.sqrt(_ALIKE * huber(size, _HUBER))[:, :, None]
-    both = np.concatenate([by_pose, by_field, residuals[:, :, None]], axis=2) * root
+    equations = np.concatenate([by_pose, by_field, residuals[:, :, None]], axis=2) * root
     information, gradient = np.zeros((_TERMS, _TERMS)), np.zeros(_TERMS)
-    for number in np.unique(these["keyframe"]).tolist():
-        part = both[these["keyframe"] == number].reshape(-1, 6 + _TERMS + 1)
+    for number in np.unique(table["keyframe"]).tolist():
+        part = equations[table["keyframe"] == number].reshape(-1, 6 + _TERMS + 1)
         if len(part) < 3 * _FEW:
             continue
         normal = part.T @ part
         eliminated = np.linalg.solve(normal[:6, :6] + _VAGUE * np.eye(6), normal[:6, 6:])
-        rest = normal[6:, 6:] - normal[6:, :6] @ eliminated
-        information += rest[:_TERMS, :_TERMS]
-        gradient += rest[:_TERMS, _TERMS]
+        reduced = normal[6:, 6:] - normal[6:, :6] @ eliminated
+        information += reduced[:_TERMS, :_TERMS]
+        gradient += reduced[:_TERMS, _TERMS]
     return information, gradient

@@ -103,22 +103,22 @@ class StereoMatcher:
         Raises:
             ValueError: The size is not that of the camera.
         """
-        pair = whole = grey_image(self._info, left), grey_image(self._info, right)
+        pair = full_size = grey_image(self._info, left), grey_image(self._info, right)
         if self._reduction > 1:
             pair = (
                 np.asarray(cv2.pyrDown(pair[0]), np.uint8),
                 np.asarray(cv2.pyrDown(pair[1]), np.uint8),
             )
         matched: Any = self._blocks.compute(*pair)  # sixteenths of a pixel
-        self._pair = whole[0], scaled(whole[1], brightness_ratio(*pair, matched))
+        self._pair = full_size[0], scaled(full_size[1], brightness_ratio(*pair, matched))
         disparity: Any = matched.astype(np.float32) * (self._reduction / 16.0)
         if self._reduction > 1:
             size = self._info.width, self._info.height
             disparity = cv2.resize(disparity, size, interpolation=cv2.INTER_NEAREST)
-        known = disparity > 0.0
+        valid = disparity > 0.0
         disparity += self.disparities.everywhere()
         depth = np.full(disparity.shape, np.inf, np.float32)
-        np.divide(self.unit, disparity, out=depth, where=known & (disparity > self._least))
+        np.divide(self.unit, disparity, out=depth, where=valid & (disparity > self._least))
         return depth
 
     def surfaces_at(
@@ -132,13 +132,13 @@ class StereoMatcher:
         if self._pair is None or not len(pixels):
             return coarse
         rows, without = np.flatnonzero(coarse.continuous), np.flatnonzero(~coarse.continuous)
-        there, slope = coarse.inverse * self.unit, coarse.slope.copy()
-        fine = np.zeros(len(pixels))
+        guess, slope = coarse.inverse * self.unit, coarse.slope.copy()
+        refined = np.zeros(len(pixels))
         if len(rows):
-            disparity, good = self._disparity(pixels[rows], there[rows], 0)
-            good &= np.abs(disparity - there[rows]) < _REFINED
+            disparity, good = self._disparity(pixels[rows], guess[rows], 0)
+            good &= np.abs(disparity - guess[rows]) < _REFINED
             good &= self._is_distinct(pixels[rows], disparity)
-            fine[rows[good]] = disparity[good]
+            refined[rows[good]] = disparity[good]
         if len(without):
             # Blocks match on little texture, and at no outline; flow finds any corner, and says by
             # its neighbourhood whether that is a plane.
@@ -152,18 +152,18 @@ class StereoMatcher:
             good &= all_good.reshape(-1, len(_BESIDE)).all(axis=1)
             good &= bend < np.maximum(_TORN * disparity, _BENT)
             good &= self._is_distinct(centre, disparity)
-            fine[without[good]] = disparity[good]
+            refined[without[good]] = disparity[good]
             change = np.stack([right - left, below - above], axis=1) / (2 * _ASIDE)
             slope[without] = change / self.unit
-        return Surfaces(fine / self.unit, slope, fine > 0)
+        return Surfaces(refined / self.unit, slope, refined > 0)
 
     def _disparity(
         self, pixels: Floats, guess: Floats, levels: int
     ) -> tuple[Floats, npt.NDArray[np.bool_]]:
         """Return disparities by flow from a guess, and a mask of the good, both (n,)."""
         assert self._pair is not None
-        there = self._right_of(pixels, guess)
-        matches, good = follow_both_ways(*self._pair, pixels, there, _WINDOW, levels)
+        start = self._to_right(pixels, guess)
+        matches, good = follow_both_ways(*self._pair, pixels, start, _WINDOW, levels)
         disparity = pixels[:, 0] - matches[:, 0] + self.disparities.at(pixels)
         offsets = matches[:, 1] - pixels[:, 1]
         tolerance = _OFF_ROW + _UNSURE * self.rows.deviation(pixels)
@@ -173,7 +173,7 @@ class StereoMatcher:
             good &= np.abs(offsets - self.rows.at(pixels)) < _OFF_ROW
         return disparity, good
 
-    def _right_of(self, pixels: Floats, disparity: Floats) -> Floats:
+    def _to_right(self, pixels: Floats, disparity: Floats) -> Floats:
         """Return where pixels of the left image are in the right one, shape (n, 2)."""
         across, down = self.disparities.at(pixels) - disparity, self.rows.at(pixels)
         return pixels + np.stack([across, down], axis=1)
@@ -181,9 +181,9 @@ class StereoMatcher:
     def _is_distinct(self, pixels: Floats, disparity: Floats) -> npt.NDArray[np.bool_]:
         """Return a mask of distinct disparities; noise and level edges fit any."""
         assert self._pair is not None
-        left, there = around(self._pair[0], pixels, _WINDOW), self._right_of(pixels, disparity)
+        left, matches = around(self._pair[0], pixels, _WINDOW), self._to_right(pixels, disparity)
         at, before, after = (
-            correlation(left, around(self._pair[1], there + np.array([step, 0.0]), _WINDOW))
+            correlation(left, around(self._pair[1], matches + np.array([step, 0.0]), _WINDOW))
             for step in (0.0, -_STEP, _STEP)
         )
         return (at > SAME) & (1.0 - np.maximum(before, after) > _DISTINCT * (1.0 - at))
@@ -197,12 +197,16 @@ def brightness_ratio(left: Grey, right: Grey, disparity: npt.NDArray[np.int16]) 
     """
     rows, columns = np.nonzero(disparity[::_SPARSE, ::_SPARSE] > 0)
     rows, columns = rows * _SPARSE, columns * _SPARSE
-    here = left[rows, columns]
-    there = right[rows, np.maximum(columns - ((disparity[rows, columns] + 8) >> 4), 0)]
-    usable = (np.minimum(here, there) > _BLACK) & (np.maximum(here, there) < _WHITE)
+    left_levels = left[rows, columns]
+    right_levels = right[rows, np.maximum(columns - ((disparity[rows, columns] + 8) >> 4), 0)]
+    usable = (np.minimum(left_levels, right_levels) > _BLACK) & (
+        np.maximum(left_levels, right_levels) < _WHITE
+    )
     if np.count_nonzero(usable) < _FEW:
         return 1.0
-    return int(here[usable].sum(dtype=np.int64)) / int(there[usable].sum(dtype=np.int64))
+    return int(left_levels[usable].sum(dtype=np.int64)) / int(
+        right_levels[usable].sum(dtype=np.int64)
+    )
 
 
 def scaled(image: Grey, factor: float) -> Grey:

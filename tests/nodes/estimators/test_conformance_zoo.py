@@ -133,7 +133,7 @@ class Talks(Good):
     def say(self, image: Any, result: TrackingResult) -> None:
         self.publish(image, result)
         if result.lost:
-            mount = self._mount_of(result.map, image.stamp)
+            mount = self._mount(result.map, image.stamp)
             self.estimates.send(mount.estimate(image.stamp, self.name, result))
 
 

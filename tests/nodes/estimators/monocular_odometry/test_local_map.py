@@ -198,7 +198,7 @@ def test_tracks_remember_their_views_and_hand_over_landmarks_that_leave() -> Non
     tracks = Tracks(np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), 0)
     assert not tracks.known.any()
     tracks.points[:2] = [[0, 0, 1], [0, 0, 2]]
-    gone = tracks.keep(np.array([1, 2]))
+    gone = tracks.retain(np.array([1, 2]))
     assert [(point.tolist(), views) for point, views in gone] == [([0, 0, 1], {0: (1, 2)})]
     tracks.add_view(1, np.array([[3.5, 4.0], [5.5, 6.0]]))
     tracks.add(np.array([[9.0, 9.0]]), 1)
