@@ -60,7 +60,7 @@ Calls = dict[str, list[tuple[str, int]]]
 
 _BEGIN = struct.Struct("<Q")
 _CHECKSUM = 16
-_REST = 10.0  # seconds of the clock for a flight to go on without ticks: answers still arrive
+_FINAL_PAUSE = 10.0  # seconds of the clock after a flight's end, without ticks, for pending answers
 _DONE: concurrent.futures.Future[None] = concurrent.futures.Future()
 _DONE.set_result(None)
 
@@ -87,19 +87,19 @@ def recorded(config: Config, *, record: bool) -> Watch | None:
         for file in (path, _unfinished(path)):
             if file.exists() and not file.is_file():
                 raise OSError(errno.EEXIST, "what is no file", str(file))
-        with _locked(path):  # whoever comes second waits, and finds it
-            opened = _opened(path)
+        with _locked(path):  # a second process waits for the first one's file
+            opened = _read(path)
             if opened is None and record:
                 _write(part, path)
-                opened = _opened(path)
+                opened = _read(path)
             if opened is None:
                 return None
             os.utime(path)
     except OSError as error:
-        what = f"{error.filename or home()}: {error.strerror}"
-        _LOG.warning("expected a cache of flights, found %s: the run flies itself", what)
+        problem = f"{error.filename or home()}: {error.strerror}"
+        _LOG.warning("expected a cache of flights, found %s: the run flies itself", problem)
         return None
-    return functools.partial(_played, *opened)
+    return functools.partial(_replaying, *opened)
 
 
 def home() -> Path:
@@ -127,12 +127,12 @@ def remove_beyond(gigabytes: float) -> list[Kept]:
         if unfinished.is_file():
             _remove(unfinished, unfinished.with_name(unfinished.stem[1:]))
     sizes = 0
-    beyond = [flight for flight in kept() if (sizes := sizes + flight.size) > gigabytes * 1e9]
-    return [flight for flight in beyond if _remove(flight.path, flight.path)]
+    removable = [flight for flight in kept() if (sizes := sizes + flight.size) > gigabytes * 1e9]
+    return [flight for flight in removable if _remove(flight.path, flight.path)]
 
 
 def _remove(file: Path, flight: Path) -> bool:
-    """Remove a file of a flight, unless the flight is locked; tell whether removed."""
+    """Remove a file of a flight, unless the flight is locked; return whether removed."""
     with contextlib.suppress(OSError), _locked(flight, wait=False):
         file.unlink(missing_ok=True)
         return True
@@ -146,7 +146,7 @@ def _write(part: Config, path: Path) -> None:
         limit = float(os.environ.get("VISNAV_FLIGHTS_GB", LIMIT))
         remove_beyond(max(limit - new.stat().st_size / 1e9, 0.0))
         new.rename(path)
-    except (VisnavError, OSError):  # the run itself meets the same, and says so
+    except (VisnavError, OSError):  # the run itself reports it
         pass
     finally:
         new.unlink(missing_ok=True)
@@ -158,7 +158,7 @@ def _unfinished(path: Path) -> Path:
 
 @contextlib.contextmanager
 def _locked(path: Path, *, wait: bool = True) -> Iterator[None]:
-    # Neither a pipe of this name nor a link makes it wait for ever, or write elsewhere.
+    # The flags prevent waiting at a pipe of this name, and writing through a link.
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
     file = os.open(path.with_name(f".{path.name}.lock"), flags, 0o644)
     try:
@@ -179,24 +179,24 @@ def fly(config: Config, path: Path) -> None:
         KeyboardInterrupt: A signal ended it.
         OSError: The file cannot be written.
     """
-    rest = NodeSpec(
-        name="(rest)", type_name="", on_error="stop", inputs={}, links={}, node=_Rest,
+    final_pause = NodeSpec(
+        name="(rest)", type_name="", on_error="stop", inputs={}, links={}, node=_FinalPause,
         config=NodeConfig(),
     )  # fmt: skip
     run = msgspec.structs.replace(config.run, digest=False, speed=None)
-    config = msgspec.structs.replace(config, run=run, nodes=(*config.nodes, rest))
+    config = msgspec.structs.replace(config, run=run, nodes=(*config.nodes, final_pause))
     with path.open("wb", buffering=1 << 20) as file:
         recorder = _Recorder(file)
         execute(config, watch=recorder.watch)
-        file.write(_BEGIN.pack(put(file, recorder.calls)))
+        file.write(_BEGIN.pack(write_object(file, recorder.calls)))
         file.flush()
         file.write(xxhash.xxh3_128_digest(_content(path)))
 
 
-class _Rest(Node):
+class _FinalPause(Node):
     async def on_shutdown(self) -> None:
-        """Let time go on, the last node in the file being the first to end."""
-        await self.clock.sleep(_REST)
+        """Keep the clock running until pending answers arrive; nodes end in reverse order."""
+        await self.clock.sleep(_FINAL_PAUSE)
 
 
 class _Recorder(Instrument):
@@ -209,7 +209,7 @@ class _Recorder(Instrument):
     def watch(self, supervisor: Supervisor) -> Iterator[None]:
         supervisor.instruments.attach(self)
         yield
-        if supervisor.state.stop_requested:  # whatever was to follow is not wanted either
+        if supervisor.state.stop_requested:  # by the user, who ends the command, too
             raise KeyboardInterrupt
 
     def worker_called(
@@ -219,23 +219,23 @@ class _Recorder(Instrument):
         number = len(calls)
         calls.append((method, -1))
 
-        def note(answer: concurrent.futures.Future[Any]) -> None:
+        def write_answer(answer: concurrent.futures.Future[Any]) -> None:
             error = answer.exception()
             with self._lock:  # each process has a thread of its own
-                place = put(self._file, (None if error else answer.result(), error))
+                place = write_object(self._file, (None if error else answer.result(), error))
             calls[number] = method, place
 
-        answer.add_done_callback(note)
+        answer.add_done_callback(write_answer)
 
 
-def put(file: IO[bytes], what: Any) -> int:
+def write_object(file: IO[bytes], value: Any) -> int:
     """Write an object that can be pickled; return its place."""
     place = file.tell()
-    pickle.dump(what, file, pickle.HIGHEST_PROTOCOL)
+    pickle.dump(value, file, pickle.HIGHEST_PROTOCOL)
     return place
 
 
-def taken(content: memoryview, place: int) -> Any:
+def read_object(content: memoryview, place: int) -> Any:
     """Return the object at a place of a file's content."""
     return pickle.loads(content[place:])  # noqa: S301  # of this user's own cache
 
@@ -245,7 +245,7 @@ def _content(path: Path) -> memoryview:
         return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
 
 
-def _opened(path: Path) -> tuple[memoryview, Calls] | None:
+def _read(path: Path) -> tuple[memoryview, Calls] | None:
     """Return a file's content and a flight's calls; `None` if missing or not readable."""
     if not path.is_file():  # a pipe would wait for ever
         return None
@@ -253,37 +253,41 @@ def _opened(path: Path) -> tuple[memoryview, Calls] | None:
         content = _content(path)
         if xxhash.xxh3_128_digest(content[:-_CHECKSUM]) != content[-_CHECKSUM:]:
             return None
-        (begin,) = _BEGIN.unpack_from(content, len(content) - _CHECKSUM - _BEGIN.size)
-        calls: Calls = taken(content, begin)
-        for place in {place for own in calls.values() for place in dict(own).values()} - {-1}:
-            taken(content, place)  # one of each method
-    except Exception:  # what was written by other code may raise anything
+        (start,) = _BEGIN.unpack_from(content, len(content) - _CHECKSUM - _BEGIN.size)
+        calls: Calls = read_object(content, start)
+        for place in {
+            place
+            for places_by_method in calls.values()
+            for place in dict(places_by_method).values()
+        } - {-1}:
+            read_object(content, place)  # one of each method
+    except Exception:  # a file of other code may raise any error
         return None
     return content, calls
 
 
 @contextlib.contextmanager
-def _played(content: memoryview, calls: Calls, supervisor: Supervisor) -> Iterator[None]:
+def _replaying(content: memoryview, calls: Calls, supervisor: Supervisor) -> Iterator[None]:
     state = supervisor.state
-    left = {name: iter(own) for name, own in calls.items()}
+    remaining = {name: iter(answers) for name, answers in calls.items()}
 
     def make(name: str, *args: Any, **options: Any) -> Worker[Any]:
-        if name not in left:
+        if name not in remaining:
             return Worker(name, *args, **options)
-        state.costs.pop(name, None)  # it has none
-        worker = _Played(name, *args, **options)
-        worker.content, worker.left = content, left[name]
+        state.costs.pop(name, None)  # a replayed worker costs nothing
+        worker = _ReplayedWorker(name, *args, **options)
+        worker.content, worker.remaining = content, remaining[name]
         return worker
 
     state.make_worker = make
     yield
 
 
-class _Played(Worker[Any]):
+class _ReplayedWorker(Worker[Any]):
     """A worker without a process, to give recorded answers."""
 
     content: memoryview
-    left: Iterator[tuple[str, int]]
+    remaining: Iterator[tuple[str, int]]
 
     def _begin(self) -> list[Any]:
         return []
@@ -297,13 +301,13 @@ class _Played(Worker[Any]):
         args: Any,  # noqa: ARG002
         kwargs: Any,  # noqa: ARG002
     ) -> concurrent.futures.Future[Any]:
-        name, place = next(self.left, ("none", -1))
+        name, place = next(self.remaining, ("none", -1))
         if place < 0 or name != method.__name__:
             raise WorkerError(
                 f"worker {self.name}: expected the calls of the recorded flight, next {name}, "
                 f"found {method.__name__}: a sweep with --fly does without it"
             )
-        result, error = taken(self.content, place)
+        result, error = read_object(self.content, place)
         work: concurrent.futures.Future[Any] = concurrent.futures.Future()
         if error is not None:
             work.set_exception(error)

@@ -68,29 +68,29 @@ class Findings(msgspec.Struct, frozen=True):
 
 def of_file(config: Config, only: Collection[str] = ()) -> Findings:
     """Check the settings of a file, and the classes of its nodes."""
-    here = [spec for spec in config.nodes if not only or spec.name in only]
+    specs = [spec for spec in config.nodes if not only or spec.name in only]
     warnings = [
         f"{node}.{port}: expects {event}, and no node sends it"
         for node, port, event in unconnected([(spec.name, spec.node) for spec in config.nodes])
     ]
     warnings += [
         f"{spec.name}.{port}: no method of {spec.type_name} reads it"
-        for spec in here
+        for spec in specs
         for port in _unread(spec.node)
     ]
     warnings += [
         f"expected handlers that come to an end, found some that always answer one another: {loop}"
         for loop in circles([(spec.name, spec.node) for spec in config.nodes])
     ]
-    return Findings(list(_clashes(here)), warnings)
+    return Findings(list(_clashes(specs)), warnings)
 
 
 def of_nodes(config: Config) -> Findings:
-    """Bring all nodes up to where their first update would be, and take them down again."""
+    """Start all nodes, up to their first update, and shut them down again."""
     errors: list[str] = []
     loop = make_loop(config.run)
-    with asyncio.Runner(loop_factory=lambda: loop) as runner, _logged() as logged:
-        warnings, facts = logged[logging.WARNING], logged[logging.INFO]
+    with asyncio.Runner(loop_factory=lambda: loop) as runner, _collect_log() as messages:
+        warnings, facts = messages[logging.WARNING], messages[logging.INFO]
         announced = runner.run(_rehearse(config, errors, warnings))
     return Findings(errors, warnings, tuple(announced), tuple(facts))
 
@@ -108,29 +108,31 @@ async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> l
         return task
 
     runners = [NodeRunner(spec, create) for spec in config.nodes]
-    cut_short: set[str] = set()
+    failed_startups: set[str] = set()
     uncertain = False
-    everything: list[Announcement] = []
+    announcements: list[Announcement] = []
 
     async def start(runner: NodeRunner) -> None:
         await runner.start_up(host, config.run.startup_limit)
 
     async def exchange(announced: Announced) -> list[Announcement]:
-        everything.extend(a for of_node in announced.values() for a in of_node)
-        (warnings if uncertain else errors).extend(_unknown_sources(config.nodes, everything))
-        return everything
+        announcements.extend(
+            a for node_announcements in announced.values() for a in node_announcements
+        )
+        (warnings if uncertain else errors).extend(_unknown_sources(config.nodes, announcements))
+        return announcements
 
     def failed(phase: Phase, runner: NodeRunner, error: NodeError) -> None:
         nonlocal uncertain
         if phase == "on_startup":
-            cut_short.add(runner.spec.name)
+            failed_startups.add(runner.spec.name)
             if isinstance(error.__cause__, UncheckableError):
                 uncertain = True
                 warnings.append(f"{runner.spec.name}: {error.__cause__}: not all can be checked")
             elif not isinstance(error.__cause__, _NoWorkerError):
                 errors.append(str(error))
         elif phase == "announce":
-            if runner.spec.name not in cut_short:
+            if runner.spec.name not in failed_startups:
                 errors.append(str(error))
         elif not any(reported.startswith(f"{runner.spec.name}: inputs.") for reported in errors):
             (warnings if uncertain else errors).append(str(error))
@@ -143,17 +145,17 @@ async def _rehearse(config: Config, errors: list[str], warnings: list[str]) -> l
             failed=failed,
             owners=SourceOwners(spec.name for spec in config.nodes),
             limit=config.run.startup_limit,
-            give_up=lambda: bool(errors),  # what others then miss is of no interest
+            give_up=lambda: bool(errors),  # later errors only follow from these
         )
     finally:
         before = len(warnings)
         for runner in reversed(runners):
             runner.stop_receiving()
             await runner.shut_down(config.run.shutdown_limit)
-        del warnings[before:]  # that nothing came is no news
+        del warnings[before:]  # of nodes that received nothing, as expected here
         host.executor.shutdown(wait=False, cancel_futures=True)
         clock.close()
-    return everything
+    return announcements
 
 
 class _NoWorkerError(VisnavError):
@@ -174,8 +176,8 @@ class _DryHost(Host):
     checking = True
 
     def __init__(self, config: Config, clock: Clock) -> None:
-        here = {spec.name for spec in config.nodes}
-        super().__init__(clock, config.run.seed, siblings(config, here))
+        names = {spec.name for spec in config.nodes}
+        super().__init__(clock, config.run.seed, siblings(config, names))
         self.stepping = Stepping(clock)
         self.executor = concurrent.futures.ThreadPoolExecutor(
             max_workers=2, thread_name_prefix="offload"
@@ -210,7 +212,7 @@ class _DryHost(Host):
 
 
 @contextlib.contextmanager
-def _logged() -> Iterator[dict[int, list[str]]]:
+def _collect_log() -> Iterator[dict[int, list[str]]]:
     """Collect the messages of nodes by level: information and warnings."""
     messages: dict[int, list[str]] = {logging.INFO: [], logging.WARNING: []}
 
@@ -220,17 +222,17 @@ def _logged() -> Iterator[dict[int, list[str]]]:
                 name = record.name.removeprefix("visnav.")
                 messages[record.levelno].append(f"{name}: {record.getMessage()}")
 
-    ours, handler = logging.getLogger("visnav"), Collect()
-    before = ours.propagate, ours.level
-    ours.propagate = False
-    ours.setLevel(logging.INFO)
-    ours.addHandler(handler)
+    logger, handler = logging.getLogger("visnav"), Collect()
+    settings_before = logger.propagate, logger.level
+    logger.propagate = False
+    logger.setLevel(logging.INFO)
+    logger.addHandler(handler)
     try:
         yield messages
     finally:
-        ours.removeHandler(handler)
-        ours.propagate = before[0]
-        ours.setLevel(before[1])
+        logger.removeHandler(handler)
+        logger.propagate = settings_before[0]
+        logger.setLevel(settings_before[1])
 
 
 def _clashes(nodes: Iterable[NodeSpec]) -> Iterator[str]:
@@ -259,11 +261,11 @@ def mentioned_in(cls: type[Node[Any]]) -> set[Any]:
     """Return the names and texts in the methods of a class."""
     mentioned: set[Any] = set()
 
-    def look(code: CodeType) -> None:
+    def add_names(code: CodeType) -> None:
         mentioned.update(code.co_names)
         for constant in code.co_consts:
             if isinstance(constant, CodeType):
-                look(constant)
+                add_names(constant)
             else:
                 mentioned.add(constant if isinstance(constant, str) else "")
 
@@ -271,7 +273,7 @@ def mentioned_in(cls: type[Node[Any]]) -> set[Any]:
         for value in vars(base).values():
             function = getattr(value, "fget", None) or getattr(value, "__func__", value)
             if isinstance(code := getattr(function, "__code__", None), CodeType):
-                look(code)
+                add_names(code)
     return mentioned
 
 
@@ -281,25 +283,25 @@ def _unknown_sources(nodes: Iterable[NodeSpec], announced: Iterable[Announcement
     sources = dict.fromkeys([*specs, *(announcement.source for announcement in announced)])
     for spec in specs.values():
         for port, source in spec.inputs.items():
-            where = f"{spec.name}: inputs.{port}"
+            place = f"{spec.name}: inputs.{port}"
             events = _types(spec.node, port)
             owner = source.partition("/")[0]
-            below = [known for known in sources if known.startswith(f"{owner}/")]
+            below_owner = [known for known in sources if known.startswith(f"{owner}/")]
             if owner in specs and not _may_send(specs[owner].node, events):
                 names = " or ".join(event.__name__ for event in events)
-                yield f"{where}: expected a source of {names}, found {source}: {owner} sends none"
+                yield f"{place}: expected a source of {names}, found {source}: {owner} sends none"
             elif not (
                 source in specs
-                or (owner in specs and not below)
+                or (owner in specs and not below_owner)
                 or any(
                     f"{known}/".startswith(f"{source}/")
                     or ("/" in known and source.startswith(f"{known}/"))
                     for known in sources
                 )
             ):
-                known = ", ".join(below or sources)
+                known = ", ".join(below_owner or sources)
                 yield (
-                    f"{where}: expected one of {known}, found {source}{suggest(source, sources)}"
+                    f"{place}: expected one of {known}, found {source}{suggest(source, sources)}"
                 )
 
 
@@ -354,16 +356,19 @@ def lint(
     Args:
         ignore: Names of rules that are left out, or ``rule:subject``.
     """
-    known = rules()
+    rules_by_name = rules()
     accepted = {*config.run.accept, *ignore}
     findings = [
         Finding(
-            "run", f"accept names no rule: {name}", f"take it out{suggest(name, known)}", "accept"
+            "run",
+            f"accept names no rule: {name}",
+            f"take it out{suggest(name, rules_by_name)}",
+            "accept",
         )
         for name in sorted(accepted)
-        if name.partition(":")[0] not in known
+        if name.partition(":")[0] not in rules_by_name
     ]
-    for name, rule in known.items():
+    for name, rule in rules_by_name.items():
         if name not in accepted:
             odd = (msgspec.structs.replace(one, rule=name) for one in rule(config, announcements))
             findings += [one for one in odd if f"{name}:{one.subject}" not in accepted]

@@ -42,7 +42,7 @@ class Track(Digest):
         self._places: dict[str, array[float]] = {}
 
     def __call__(self, sender: Sender[Any] | None, event: Event) -> None:
-        """Take in an event, and compare with the earlier run."""
+        """Compare an event with the first run's event."""
         super().__call__(sender, event)
         name = self.name_of(sender, event)
         marks = self._marks.setdefault(name, array("Q"))
@@ -51,10 +51,16 @@ class Track(Digest):
         if self._before is None:
             self._places.setdefault(name, array("d")).extend(place)
             return
-        number, then = len(marks) - 1, self._before._marks.get(name, array("Q"))
-        if self.first is None and (number >= len(then) or then[number] != marks[number]):
-            was = self._before._places.get(name, array("d"))[3 * number : 3 * number + 3]
-            self.first = name, event, math.dist(place, was) if len(was) == 3 else math.nan
+        number, marks_before = len(marks) - 1, self._before._marks.get(name, array("Q"))
+        if self.first is None and (
+            number >= len(marks_before) or marks_before[number] != marks[number]
+        ):
+            place_before = self._before._places.get(name, array("d"))[3 * number : 3 * number + 3]
+            self.first = (
+                name,
+                event,
+                math.dist(place, place_before) if len(place_before) == 3 else math.nan,
+            )
 
 
 def run_twice(
@@ -67,8 +73,8 @@ def run_twice(
         VisnavError: Something went wrong in one of the runs.
     """
     if config.run.clock != "lockstep" or only:
-        given = "--only" if only else f'clock = "{config.run.clock}"'
-        raise ConfigError(f'--twice: expected one process and clock = "lockstep", found {given}')
+        problem = "--only" if only else f'clock = "{config.run.clock}"'
+        raise ConfigError(f'--twice: expected one process and clock = "lockstep", found {problem}')
     first = Track()
     before = execute(config, digest=first)
     second = Track(first)
@@ -90,32 +96,34 @@ def compared(before: Summary, after: Summary, track: Track) -> Summary:
     )
     outside, systems = {}, []
     for name, system in after.outside.items():
-        was = before.outside.get(name, system)
-        outside[name] = _compared(was, system)
-        if (was.inputs, was.answers) != (system.inputs, system.answers):
+        system_before = before.outside.get(name, system)
+        outside[name] = _compare_systems(system_before, system)
+        if (system_before.inputs, system_before.answers) != (system.inputs, system.answers):
             systems.append(name)
     same = not outputs and not systems
-    twice = TwiceSummary(same, "" if same else _who(after, track, outputs + systems), outputs)
+    twice = TwiceSummary(
+        same, "" if same else _describe_first(after, track, outputs + systems), outputs
+    )
     if not same:
         log.warning("run twice, it differs: %s", twice.first)
     return replace(after, outside=outside, twice=twice)
 
 
-def _compared(was: OutsideSummary, now: OutsideSummary) -> OutsideSummary:
-    if was.inputs != now.inputs:
-        why = [*now.why_not, "its inputs differed when run twice"]
-        return replace(now, reproducible=False, why_not=why)
-    return replace(now, repeats=was.answers == now.answers)
+def _compare_systems(before: OutsideSummary, now: OutsideSummary) -> OutsideSummary:
+    if before.inputs != now.inputs:
+        reasons = [*now.why_not, "its inputs differed when run twice"]
+        return replace(now, reproducible=False, why_not=reasons)
+    return replace(now, repeats=before.answers == now.answers)
 
 
-def _who(summary: Summary, track: Track, differ: list[str]) -> str:
+def _describe_first(summary: Summary, track: Track, differ: list[str]) -> str:
     if track.first is None:  # events are missing at the end of an output
         return f"{', '.join(differ)} at the end"
-    output, event, apart = track.first
+    output, event, distance = track.first
     node = output.partition(".")[0]
     outside = node in summary.outside or event.source in summary.outside
-    far = "" if math.isnan(apart) else f", {apart:.2g} m apart"
+    distance_text = "" if math.isnan(distance) else f", {distance:.2g} m apart"
     return (
         f"{'the system ' + event.source if outside else 'the rig, ' + node}, in {output}: "
-        f"{type(event).__name__} of {event.source}, {event.stamp / 1e9:.6f} s{far}"
+        f"{type(event).__name__} of {event.source}, {event.stamp / 1e9:.6f} s{distance_text}"
     )

@@ -77,12 +77,12 @@ class Commands(TyperGroup):
             ConfigError: There is no such command.
             CommandError: It cannot be imported.
         """
-        name, *rest = args
+        name, *arguments = args
         listed = ", ".join(_commands())
         if name not in _commands() and (extension := missing_extension(name)):
             raise ConfigError(f"{name} is a command of {extension}")
         expect_known(name, _commands(), f"expected a command ({listed}), found {name!r}")
-        return name, load(_chosen(name)), rest
+        return name, load(_chosen(name)), arguments
 
     def make_context(self, *args: Any, **options: Any) -> Any:
         """Read the arguments before the command."""
@@ -123,7 +123,7 @@ def load(offer: Offer) -> Any:
         command = app
     try:
         return typer.main.get_command(command)
-    except Exception as error:  # whatever Typer does not like
+    except Exception as error:  # Typer raises various types
         raise CommandError(
             f"{offer.name} of the package {offer.package}: expected {offer.value!r} to be a "
             f"function as Typer takes it, found: {error}"
@@ -139,10 +139,10 @@ def _commands() -> dict[str, list[Offer]]:
 
 
 def _chosen(name: str) -> Offer:
-    used, *others = _commands()[name]
-    for other in others:
+    used, *unused = _commands()[name]
+    for offer in unused:
         warn(
-            f"the packages {used.package} and {other.package} both offer the command {name}; "
+            f"the packages {used.package} and {offer.package} both offer the command {name}; "
             f"that of {used.package} is used"
         )
     return used
@@ -214,12 +214,12 @@ def chosen_format(
         CommandError: Several are given, or figures without any.
     """
     options = {"latex": latex, "markdown": markdown, "csv": csv}
-    given: list[Any] = [name for name, wanted in options.items() if wanted]
-    if len(given) > 1:
-        raise CommandError(f"expected one format of the table, found --{' and --'.join(given)}")
-    if figures and not given:
+    formats: list[Any] = [name for name, is_set in options.items() if is_set]
+    if len(formats) > 1:
+        raise CommandError(f"expected one format of the table, found --{' and --'.join(formats)}")
+    if figures and not formats:
         raise CommandError("--figure: expected --latex, --markdown or --csv beside it, found none")
-    return given[0] if given else None
+    return formats[0] if formats else None
 
 
 State = Literal["passed", "failed", "crashed", "not judged"]

@@ -296,13 +296,13 @@ def import_(
     suffixes = {path.suffix.lower().lstrip(".") for path in files}
     names = " and ".join(path.name for path in files)
     if len(suffixes) > 1 or not suffixes <= kinds.keys():
-        known = ", ".join(f".{kind}" for kind in kinds)
-        raise ConfigError(f"import: expected files of one kind ({known}), found {names}")
+        suffix_list = ", ".join(f".{kind}" for kind in kinds)
+        raise ConfigError(f"import: expected files of one kind ({suffix_list}), found {names}")
     read = kinds[suffixes.pop()].load()
     warnings: list[str] = []
-    given = {} if world is None else {"world": world}
+    options = {} if world is None else {"world": world}
     text = "\n".join(text_of(path) for path in files)
-    table = read(text, names, warnings.append, **given)
+    table = read(text, names, warnings.append, **options)
     for line in warnings:
         warn(line)
     print(f"# Made from {names} by `python -m runtime import`.")
@@ -401,9 +401,9 @@ def new_estimator(
 
     if not re.fullmatch("[a-z][a-z0-9_]*", name):
         raise CommandError(f"expected a name of small letters, digits and _, found {name!r}")
-    called = "".join(word.capitalize() for word in name.split("_"))
-    words = {
-        Language.PYTHON: {"own_estimator": name, "OwnEstimator": called, '"own"': f'"{name}"'},
+    class_name = "".join(word.capitalize() for word in name.split("_"))
+    replacements = {
+        Language.PYTHON: {"own_estimator": name, "OwnEstimator": class_name, '"own"': f'"{name}"'},
         Language.CPP: {
             "outside_cpp": name,
             "odometry.cpp": f"{name}.cpp",
@@ -413,20 +413,20 @@ def new_estimator(
         },
         Language.ROS2: {"outside_ros2": name},
     }[language]
-    words["examples/"] = ""
-    copied = _copy(example_files()[next(iter(words))], out, words)
+    replacements["examples/"] = ""
+    copied = _copy(example_files()[next(iter(replacements))], out, replacements)
     print(f"try: python -m runtime run {copied}")
 
 
-def _copy(example: Path, out: Path, words: dict[str, str]) -> Path:
+def _copy(example: Path, out: Path, replacements: dict[str, str]) -> Path:
     """Copy an example with all that it reads, words replaced, and the schema; return the copy."""
     import re
 
     from runtime.errors import CommandError
 
     def renamed(text: str) -> str:
-        for word, other in words.items():
-            text = text.replace(word, other)
+        for text_part, replacement in replacements.items():
+            text = text.replace(text_part, replacement)
         return text
 
     listed = [example, *_read_by(example)]
@@ -437,7 +437,7 @@ def _copy(example: Path, out: Path, words: dict[str, str]) -> Path:
     for file, target in zip(files, targets, strict=True):
         target.parent.mkdir(parents=True, exist_ok=True)
         data = file.read_bytes()
-        if words or file.suffix == ".toml":
+        if replacements or file.suffix == ".toml":
             text = re.sub(r"\A#:schema .*", f"#:schema {SCHEMA}", renamed(data.decode()))
             data = text.encode()
         target.write_bytes(data)

@@ -146,13 +146,13 @@ def run(
                 warn(note)
         else:
             options = {"a file": config, "--from": bundle, "--only": only}
-            given = [name for name, value in options.items() if value is not None]
+            options_given = [name for name, value in options.items() if value is not None]
             raise CommandError(
                 "run: expected a file, or a bundle with --from and without --only, found "
-                f"{' and '.join(given) or 'neither'}"
+                f"{' and '.join(options_given) or 'neither'}"
             )
         nodes_here = chosen(settings, only)
-        look_at(settings, nodes_here)
+        check_before_run(settings, nodes_here)
         name = "-".join([settings.run.name, *nodes_here[:1]])
         folder = Folder(out or Path("runs") / name, by_time=out is None)
         handlers, watch = observed(
@@ -198,16 +198,16 @@ def chosen(settings: Config, only: str | None) -> list[str]:
     if only is None:
         return []
     names = [spec.name for spec in settings.nodes]
-    wanted = [name.strip() for name in only.split(",") if name.strip()]
-    for name in wanted:
+    selected = [name.strip() for name in only.split(",") if name.strip()]
+    for name in selected:
         listed = f"--only {only}: expected nodes of the file ({', '.join(names)})"
         expect_known(name, names, f"{listed}, found {name}")
-    if not wanted:
+    if not selected:
         raise ConfigError("--only: expected names of nodes with commas between, found none")
-    return [] if set(wanted) == set(names) else [name for name in names if name in wanted]
+    return [] if set(selected) == set(names) else [name for name in names if name in selected]
 
 
-def look_at(settings: Config, only: Collection[str] = ()) -> None:
+def check_before_run(settings: Config, only: Collection[str] = ()) -> None:
     """Check the file before the run: print the warnings, raise `ConfigError` for errors."""
     from runtime.errors import ConfigError
     from runtime.tools.preflight import of_file
@@ -224,9 +224,9 @@ def leave_behind(code: int, last: str = "") -> NoReturn:
     from runtime.run import event_loop
 
     threads = [t for t in threading.enumerate() if t.name.startswith(("offload", "node", "zenoh"))]
-    until = time.monotonic() + _LAST_WAIT
+    deadline = time.monotonic() + _LAST_WAIT
     for thread in threads:
-        thread.join(max(until - time.monotonic(), 0.0))
+        thread.join(max(deadline - time.monotonic(), 0.0))
     stuck = [thread.name for thread in threads if thread.is_alive()]
     stuck += dict.fromkeys(task.get_name() for task in event_loop.LEFT)
     if stuck:
@@ -234,7 +234,7 @@ def leave_behind(code: int, last: str = "") -> NoReturn:
     if last:
         print(last, file=sys.stderr)
     if stuck:
-        with contextlib.suppress(OSError):  # nobody reads it any more
+        with contextlib.suppress(OSError):  # a closed pipe
             sys.stdout.flush()
             sys.stderr.flush()
         os._exit(code)
@@ -322,7 +322,7 @@ def _beside(*arguments: str) -> Iterator[None]:
     group = None if arguments[0] == "top" else 0
     with subprocess.Popen(command, process_group=group) as process:  # noqa: S603  # our own module
         over = threading.Event()
-        threading.Thread(target=_tell_when_gone, args=(process, over), daemon=True).start()
+        threading.Thread(target=_print_when_closed, args=(process, over), daemon=True).start()
         try:
             yield
         finally:
@@ -333,7 +333,7 @@ def _beside(*arguments: str) -> Iterator[None]:
                 process.terminate()
 
 
-def _tell_when_gone(process: subprocess.Popen[bytes], over: threading.Event) -> None:
+def _print_when_closed(process: subprocess.Popen[bytes], over: threading.Event) -> None:
     process.wait()
     if not over.is_set():
         print("the monitor was closed; the run goes on, Ctrl-C ends it", file=sys.stderr)
@@ -449,7 +449,7 @@ def tables(trace: Trace, encoding: str = "utf-8") -> Iterator[Table | Text]:
     from runtime.tools.cli.brief import table_of
     from runtime.tools.tracing.write import node_loads, paths, quantile
 
-    def shown(ms: list[float]) -> list[str]:
+    def quantiles(ms: list[float]) -> list[str]:
         return [f"{value:.2f}" for value in (quantile(ms, 0.5), quantile(ms, 0.99), max(ms))]
 
     routes = paths(trace)
@@ -460,7 +460,7 @@ def tables(trace: Trace, encoding: str = "utf-8") -> Iterator[Table | Text]:
             "from sensor to set-point",
             ("path", "times", "run p50 ms", "p99", "max", "real p50 ms", "p99", "max"),
             [
-                (number, len(route.run_ms), *shown(route.run_ms), *shown(route.real_ms))
+                (number, len(route.run_ms), *quantiles(route.run_ms), *quantiles(route.real_ms))
                 for number, route in enumerate(routes, 1)
             ],
         )

@@ -104,7 +104,7 @@ def sweep(
 
     from runtime.config.reading import load_configuration
     from runtime.tools import sweep as sweeping
-    from runtime.tools.cli.run import look_at
+    from runtime.tools.cli.run import check_before_run
     from runtime.tools.paper.typeset import columns_of, figures_table, typeset
     from runtime.tools.sweep.console import print_summary
     from runtime.tools.sweep.tables import summarise
@@ -122,7 +122,7 @@ def sweep(
             limit=_seconds(timeout),
         )
         changes = [f"{path}={text}" for path, text in plan.jobs[0].settings]
-        look_at(load_configuration(config, [*(overrides or []), *changes]))
+        check_before_run(load_configuration(config, [*(overrides or []), *changes]))
         rows = carry_out(plan, jobs=jobs, fresh=fresh)
         outcomes += of_rows(map(str, plan.jobs), rows)
     sweeping.write_tables(plan, rows)

@@ -32,7 +32,7 @@ from runtime.tools.comparison.statistics import (
 from runtime.tools.sweep import Job, Plan, Row, make_plan, plan_of, run_here
 from runtime.tools.sweep.console import listed
 from runtime.tools.sweep.plots import decades, template
-from runtime.tools.sweep.process import Ended, note_inputs
+from runtime.tools.sweep.process import Ended, add_inputs
 from runtime.tools.sweep.tables import decode_rows
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class Compared(msgspec.Struct, frozen=True):
 
     @property
     def worse(self) -> bool:
-        """Whether a figure is worse; with a margin, whether one may be worse by more than that."""
+        """Return whether a figure is worse; with a margin, whether one may be by more than that."""
         return any(row.fails(self.margin) for row in self.rows)
 
     def __repr__(self) -> str:
@@ -126,35 +126,37 @@ def _fly(
     options: Mapping[str, Any],
     notes: list[str],
 ) -> list[Comparison]:
-    begin: dict[str, int] = {}  # first seed by scenario
+    first_seeds: dict[str, int] = {}  # first seed by scenario
     planned: list[Job] = []
     for file in files:
-        seed = begin[file.stem] = load_configuration(file, [*overrides, *changes[0]]).run.seed
-        for side, own in zip("AB", changes, strict=True):
-            equal = [*overrides, *own, f"run.seed={seed}"]
+        seed = first_seeds[file.stem] = load_configuration(file, [*overrides, *changes[0]]).run.seed
+        for side, side_changes in zip("AB", changes, strict=True):
+            equal = [*overrides, *side_changes, f"run.seed={seed}"]
             flown = make_plan(file, overrides=equal, seeds=seeds, repeats=repeats, out=out)
             settings = (("side", side), ("scenario", file.stem))
             planned += [msgspec.structs.replace(job, settings=settings) for job in flown.jobs]
-    if len(begin) < len({*files}):
+    if len(first_seeds) < len({*files}):
         raise ConfigError(f"compare: expected files of different names, found {[*map(str, files)]}")
-    whole = plan_of(planned, out)
+    plan = plan_of(planned, out)
 
-    of_flights: dict[Key, set[str]] = {}
+    flights_by_key: dict[Key, set[str]] = {}
     for job in planned:
-        of_flights.setdefault((dict(job.settings)["scenario"], job.seed), set()).add(job.flight)
-    changed = {key for key, settings in of_flights.items() if len(settings) > 1}
+        flights_by_key.setdefault((dict(job.settings)["scenario"], job.seed), set()).add(job.flight)
+    changed = {key for key, settings in flights_by_key.items() if len(settings) > 1}
 
     def compare_first(flights: int, error: float) -> list[Comparison]:
-        now = [j for j in whole.jobs if j.seed < begin[dict(j.settings)["scenario"]] + flights]
-        rows = fly(msgspec.structs.replace(whole, jobs=tuple(now)))
+        jobs = [
+            j for j in plan.jobs if j.seed < first_seeds[dict(j.settings)["scenario"]] + flights
+        ]
+        rows = fly(msgspec.structs.replace(plan, jobs=tuple(jobs)))
         sides: dict[str, dict[Key, list[Row]]] = {"A": {}, "B": {}}
-        for job, row in zip(now, rows, strict=True):
+        for job, row in zip(jobs, rows, strict=True):
             (_, side), (_, scenario) = job.settings
             sides[side].setdefault((scenario, job.seed), []).append(row)
         notes[:] = check_flights(*(_unchanged(runs, changed) for runs in sides.values()))
         return compare_rows(sides["A"], sides["B"], error=error, **options)
 
-    same = sorted(j.id for j in planned if j.seed == begin[dict(j.settings)["scenario"]])
+    same = sorted(j.id for j in planned if j.seed == first_seeds[dict(j.settings)["scenario"]])
     key = hashlib.sha256(" ".join(same).encode()).hexdigest()[:16]
     file = out / "looks.json"
     looks = msgspec.json.decode(file.read_bytes(), type=Looks) if file.is_file() else {}
@@ -185,15 +187,17 @@ def check_flights(
     differing: dict[Key, list[str]] = {}
     unknown = []
     for key in [key for key in a if key in b]:
-        (name, ours), (other, theirs) = _inputs(a[key]), _inputs(b[key])
-        if ours is None or theirs is None:
+        (name, inputs_a), (other_name, inputs_b) = _inputs(a[key]), _inputs(b[key])
+        if inputs_a is None or inputs_b is None:
             unknown += [key] * all(not row["error"] for row in (*a[key], *b[key]))
-        elif names := sorted(n for n in {*ours, *theirs} if ours.get(n) != theirs.get(n)):
+        elif names := sorted(
+            n for n in {*inputs_a, *inputs_b} if inputs_a.get(n) != inputs_b.get(n)
+        ):
             differing[key] = names
-            if name != other:
+            if name != other_name:
                 raise ConfigError(
                     f"compare: expected two sides of the same flights, found {show(name)} and "
-                    f"{show(other)} with seed {key[1]}, in which {_some(names)} differ"
+                    f"{show(other_name)} with seed {key[1]}, in which {_some(names)} differ"
                 )
     common = sum(key in b for key in a)
     notes = []
@@ -216,14 +220,14 @@ def _edited(sides: Iterable[tuple[str, Mapping[Key, Sequence[Row]]]]) -> Iterato
     for side, runs in sides:
         edited = [row["edited"] for rows in runs.values() for row in rows if row.get("edited")]
         if edited:
-            what = listed(dict.fromkeys(change for own in edited for change in own))
-            yield f"{len(edited)} runs of {side} are of a mixture: {what} while they ran"
+            changes = listed(dict.fromkeys(change for parts in edited for change in parts))
+            yield f"{len(edited)} runs of {side} are of a mixture: {changes} while they ran"
 
 
 def _inputs(rows: Sequence[Row]) -> tuple[str, dict[str, str] | None]:
     """Return name and fingerprints of the inputs of the first run that has some."""
-    known = [(row.get("name", ""), row.get("inputs")) for row in rows if not row["error"]]
-    return next((entry for entry in known if entry[1] is not None), ("", None))
+    inputs = [(row.get("name", ""), row.get("inputs")) for row in rows if not row["error"]]
+    return next((entry for entry in inputs if entry[1] is not None), ("", None))
 
 
 def _some(names: Sequence[str]) -> str:
@@ -239,7 +243,7 @@ def read_folder(folder: Path) -> dict[Key, list[Row]]:
             settings = " ".join(f"{path}={text}" for path, text in row["parameters"].items())
             if "inputs" not in row:  # of an earlier version
                 with contextlib.suppress(OSError, msgspec.MsgspecError):
-                    note_inputs(row, _ended(folder / "runs" / row["id"]))
+                    add_inputs(row, _ended(folder / "runs" / row["id"]))
             flights.setdefault((settings or "run", row["seed"]), []).append(row)
         return flights
     try:
@@ -254,7 +258,7 @@ def read_folder(folder: Path) -> dict[Key, list[Row]]:
         passed=verdict.passed if verdict else None, digest=None, sim_seconds=ended.sim_seconds,
         run_seconds=None, wall_seconds=None, estimators=verdict.estimators if verdict else {},
     )  # fmt: skip
-    note_inputs(row, ended)
+    add_inputs(row, ended)
     return {("run", ended.seed): [row]}
 
 

@@ -78,12 +78,12 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def unit(self) -> str:
-        """Of the change and its interval."""
+        """Unit of the change and its interval."""
         return "%" if self.relative else figure(self.figure).unit
 
     @property
     def words(self) -> str:
-        """Verdict as a reader wants it: "not enough runs: 5 more may tell"."""
+        """Verdict in words: "not enough runs: 5 more may tell"."""
         if self.missing:
             return f"{self.verdict}: not there in {self.missing}"
         if self.verdict == "identical" and self.more:
@@ -98,7 +98,7 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def medians(self) -> list[str]:
-        """Of A and of B, each with its flights without the figure: ``0.31 m (2 failed)``."""
+        """Medians of A and of B, with flights without the figure: ``0.31 m (2 failed)``."""
         unit = figure(self.figure).unit
         return [
             ("–" if value is None else f"{value:.4g} {unit}") + f" ({lost} failed)" * bool(lost)
@@ -150,32 +150,32 @@ def compare_values(
         error: Probability of a difference found where there is none.
     """
     sign = -1.0 if figure(name).limit == "least" else 1.0  # of a change for the worse
-    known = [(a, b) for a, b in pairs.values() if a is not None and b is not None]
-    relative = bool(known) and all(a > 0 and b > 0 for a, b in known)
-    changes = np.array([math.log(b / a) if relative else b - a for a, b in known])
+    complete = [(a, b) for a, b in pairs.values() if a is not None and b is not None]
+    relative = bool(complete) and all(a > 0 and b > 0 for a, b in complete)
+    changes = np.array([math.log(b / a) if relative else b - a for a, b in complete])
     # Farther than any average of two differences: the sign of a failure's pair is all that counts.
     worst = 1e3 * (abs(changes).max(initial=0.0) + 1.0)
     lost = [(a is None, b is None) for a, b in pairs.values() if a is None or b is None]
     differences = np.concatenate([changes, [sign * worst * (int(b) - int(a)) for a, b in lost]])
     p, change, low, high = signed_rank(differences, error)
 
-    def told(value: float) -> float:
+    def to_change(value: float) -> float:
         if abs(value) > worst / 4:
             return math.copysign(math.inf, value)
         return 100.0 * math.expm1(value) if relative else value
 
-    change, low, high = told(change), told(low), told(high)
+    change, low, high = to_change(change), to_change(low), to_change(high)
     verdict: Word = "not enough runs"
     more = 0
     if margin > 0 and -margin <= low and high <= margin:
         verdict = "no difference"
-    elif known and not lost and all(a == b for a, b in known):
-        verdict, more = "identical", max(_least(error) - len(known), 0)
+    elif complete and not lost and all(a == b for a, b in complete):
+        verdict, more = "identical", max(_least(error) - len(complete), 0)
     elif p <= error and (low > 0 or high < 0):
         verdict = "worse" if (low > 0) == (sign > 0) else "better"
     else:
         more = _more(len(differences), change, low, high, margin, error)
-    medians = np.median(known, axis=0).tolist() if known else (None, None)
+    medians = np.median(complete, axis=0).tolist() if complete else (None, None)
     return Comparison(
         estimator=estimator, figure=name, a=medians[0], b=medians[1], change=change, low=low,
         high=high, relative=relative, p=p, pairs=len(pairs),
@@ -205,11 +205,11 @@ def signed_rank(differences: Floats, error: float) -> tuple[float, float, float,
     )
     # Averages beyond the interval at each end: of the plain ranks, which no ties can spoil.
     tail = np.cumsum(_sums(np.arange(1, n + 1)))
-    beyond = int(np.searchsorted(tail, error / 2, side="right"))
+    tail_count = int(np.searchsorted(tail, error / 2, side="right"))
     change = float(np.median(averages))
-    if not beyond:
+    if not tail_count:
         return float(p), change, -math.inf, math.inf
-    return float(p), change, float(averages[beyond - 1]), float(averages[-beyond])
+    return float(p), change, float(averages[tail_count - 1]), float(averages[-tail_count])
 
 
 def _sums(ranks: npt.NDArray[np.int_]) -> Floats:
@@ -223,7 +223,7 @@ def _sums(ranks: npt.NDArray[np.int_]) -> Floats:
 
 
 def _more(n: int, change: float, low: float, high: float, margin: float, error: float) -> int:
-    """Return how many more flights would probably tell: intervals shrink as 1 / √n."""
+    """Return how many more flights probably decide: intervals shrink as 1 / √n."""
     least = _least(error)
     if not all(map(math.isfinite, (change, low, high))):
         return max(least - n, 1)
@@ -253,12 +253,12 @@ def compare_until_sure(
     half = math.ceil(most / 2)
     looks = {half, most} if half in looked or half > max(looked, default=0) else {most}
     rows: list[Comparison] = []
-    for look in sorted(looks):
-        number = looked.index(look) if look in looked else len(looked)
+    for flights in sorted(looks):
+        number = looked.index(flights) if flights in looked else len(looked)
         error = ERROR / 2 ** (number + 1)
-        rows = compare(look, error)
-        if look not in looked and max(row.pairs for row in rows) >= _least(error / len(rows)):
-            looked.append(look)
+        rows = compare(flights, error)
+        if flights not in looked and max(row.pairs for row in rows) >= _least(error / len(rows)):
+            looked.append(flights)
         # What is identical in half of the flights may still differ in the others.
         if all(row.verdict not in {"not enough runs", "identical"} for row in rows):
             break
@@ -286,13 +286,13 @@ def compare_rows(
             "compare: expected runs of the same scenarios and seeds, found none in common: "
             f"{_some(a)}; {_some(b)}"
         )
-    ours, theirs = ([*_estimators(side.values())] for side in (a, b))
-    names = [(name, name) for name in ours if name in theirs]
-    if not names and len(ours) == len(theirs) == 1:  # two systems of different names
-        names = [(ours[0], theirs[0])]
-    if not names and bool(ours) == bool(theirs):
-        raise ConfigError(f"compare: expected an estimator in both, found {ours} and {theirs}")
-    wanted = [
+    names_a, names_b = ([*_estimators(side.values())] for side in (a, b))
+    names = [(name, name) for name in names_a if name in names_b]
+    if not names and len(names_a) == len(names_b) == 1:  # two systems of different names
+        names = [(names_a[0], names_b[0])]
+    if not names and bool(names_a) == bool(names_b):
+        raise ConfigError(f"compare: expected an estimator in both, found {names_a} and {names_b}")
+    compared = [
         (name, other, metric)
         for name, other in names
         for metric in figures
@@ -301,25 +301,27 @@ def compare_rows(
     ]
     paired = {name for pair in names for name in pair}
     alone = [
-        *(_alone(name, "B", a, common, figures) for name in ours if name not in paired),
-        *(_alone(name, "A", b, common, figures) for name in theirs if name not in paired),
+        *(_alone(name, "B", a, common, figures) for name in names_a if name not in paired),
+        *(_alone(name, "A", b, common, figures) for name in names_b if name not in paired),
     ]
-    if not wanted and not alone:
+    if not compared and not alone:
         raise ConfigError(f"compare: expected {', '.join(figures)}, found none of them in any run")
     comparisons = []
-    for name, other, metric in wanted:
+    for name, other, metric in compared:
         pairs = {
             key: (_value(a[key], name, metric), _value(b[key], other, metric)) for key in common
         }
         label = name if name == other else f"{name} / {other}"
-        one = compare_values(label, metric, pairs, margin=margin, error=error / len(wanted))
+        comparison = compare_values(
+            label, metric, pairs, margin=margin, error=error / len(compared)
+        )
         alignments = [(_alignments(a[key], name), _alignments(b[key], other)) for key in common]
         differing = sorted({text for x, y in alignments if x and y and x != y for text in x | y})
         if differing and figure(metric).after_alignment:
-            one = msgspec.structs.replace(
-                one, verdict="not comparable", more=0, alignments=tuple(differing)
+            comparison = msgspec.structs.replace(
+                comparison, verdict="not comparable", more=0, alignments=tuple(differing)
             )
-        comparisons.append(one)
+        comparisons.append(comparison)
     return comparisons + alone
 
 
@@ -332,17 +334,17 @@ def _alone(
 ) -> Comparison:
     """Return the row of an estimator that one side does not have, with a figure of the other."""
     by_figure = {f: [_value(runs[key], name, f) for key in common] for f in figures}
-    shown = next((f for f, v in by_figure.items() if any(x is not None for x in v)), figures[0])
-    values = by_figure[shown]
-    known = [value for value in values if value is not None]
-    there = float(np.median(known)) if known else None
-    sign = -1.0 if figure(shown).limit == "least" else 1.0
+    metric = next((f for f, v in by_figure.items() if any(x is not None for x in v)), figures[0])
+    values = by_figure[metric]
+    numbers = [value for value in values if value is not None]
+    median = float(np.median(numbers)) if numbers else None
+    sign = -1.0 if figure(metric).limit == "least" else 1.0
     change = sign * (math.inf if missing == "B" else -math.inf)
-    lost, all_ = len(values) - len(known), len(values)
+    lost, all_ = len(values) - len(numbers), len(values)
     return Comparison(
-        estimator=name, figure=shown, change=change, low=change, high=change, relative=False, p=1.0,
-        pairs=all_, missing=missing, verdict="worse" if missing == "B" else "better",
-        a=None if missing == "A" else there, b=None if missing == "B" else there,
+        estimator=name, figure=metric, change=change, low=change, high=change, relative=False,
+        p=1.0, pairs=all_, missing=missing, verdict="worse" if missing == "B" else "better",
+        a=None if missing == "A" else median, b=None if missing == "B" else median,
         failures=(all_, lost) if missing == "A" else (lost, all_),
         flights={
             f"{scenario}, seed {seed}": (None, value) if missing == "A" else (value, None)

@@ -41,18 +41,18 @@ _IMAGES = 4  # newest images of a camera that are kept, for features that come l
 
 
 class Path:
-    """Places passed; the more they become, the farther apart in time are those that are kept."""
+    """Path as a list of places; the more they become, the larger is the time between them."""
 
     def __init__(self) -> None:
         self.points: Points = []
         self._spacing, self._next = SECOND // 20, 0
 
     def due(self, stamp: int) -> bool:
-        """Return whether a place of this stamp (ns) is to be kept."""
+        """Return whether to add a place of this stamp (ns)."""
         return stamp >= self._next
 
     def add(self, stamp: int, *place: float) -> None:
-        """Keep a place, rounded to millimetres."""
+        """Add a place, rounded to millimetres."""
         self.points.append(tuple(round(coordinate, 3) for coordinate in place))
         if len(self.points) > MOST_POINTS:
             del self.points[1::2]
@@ -61,17 +61,17 @@ class Path:
 
 
 class Estimator:
-    """Estimator as seen since somebody watches.
+    """State of an estimator since the monitor was opened.
 
     Attributes:
         lost: Why it has lost track, by its own word; `None` if it has not.
-        heard: When its last estimate came, on the run's clock (ns); `None` if none did.
+        received_at: Arrival of its last estimate, on the run's clock (ns); `None` before.
         latency: Of that estimate, nanoseconds.
     """
 
     def __init__(self, scale_free: bool) -> None:
         self.lost: str | None = None
-        self.heard: int | None = None
+        self.received_at: int | None = None
         self.latency = 0
         self.path = Path()
         self.scale_free = scale_free
@@ -82,16 +82,16 @@ class Estimator:
         """Return in words whether it has lost track, by its word or by silence."""
         if self.lost is not None:
             return f"lost: {self.lost}" if self.lost else "lost"
-        if self.heard is None:
+        if self.received_at is None:
             return "silent"
-        silent = now - self.heard
+        silent = now - self.received_at
         return f"lost: silent for {silent / SECOND:.1f} s" if silent > GAP else "tracking"
 
     def add(self, event: PoseEstimate, truth: Pose | None) -> None:
-        """Keep an estimate's place, laid on the truth at the first if it is not in ``map``."""
+        """Add an estimate's place, aligned at the first estimate if it is not in ``map``."""
         north, east, _ = event.position
         if self.scale_free:
-            if truth is not None:  # laid on the truth when it is shown
+            if truth is not None:  # aligned when drawn
                 self.path.add(event.stamp, east, north, truth[0][1], truth[0][0])
             return
         if event.frame_id != "map" and truth is not None:
@@ -101,8 +101,8 @@ class Estimator:
             north, east = base[0][0] + moved[0], base[0][1] + moved[1]
         self.path.add(event.stamp, east, north)
 
-    def shown(self) -> Points:
-        """Return its path; if free of scale, laid on the truth by the similarity that fits best."""
+    def points_to_draw(self) -> Points:
+        """Return its path; if free of scale, aligned by the similarity that fits best."""
         if not self.scale_free or not self.path.points:
             return list(self.path.points)
         estimated, true = (np.array(self.path.points) @ [[1, 0], [1j, 0], [0, 1], [0, 1j]]).T
@@ -115,7 +115,7 @@ class Estimator:
 
 
 class Measured:
-    """Estimators, vehicles and cameras of a run, since somebody watches.
+    """Estimators, vehicles and cameras of a run, since the monitor was opened.
 
     Attributes:
         follow: Functions to be called with events of some types, and the names of their outputs.
@@ -151,11 +151,11 @@ class Measured:
         names = self._vehicles.names
         if names and event.source not in names:  # an estimate of others
             return
-        known = self._truths.get(event.source)
-        if known is None:
+        truth = self._truths.get(event.source)
+        if truth is None:
             self._vehicles.add(event.source)
-            known = self._truths[event.source] = Path(), collections.deque(maxlen=_RECENT)
-        path, recent = known
+            truth = self._truths[event.source] = Path(), collections.deque(maxlen=_RECENT)
+        path, recent = truth
         recent.append(event)
         if path.due(event.stamp):
             path.add(event.stamp, event.position[1], event.position[0])
@@ -166,7 +166,7 @@ class Measured:
 
     def _estimate(self, _: str, event: PoseEstimate) -> None:
         estimator = self._estimator(event.source)
-        estimator.heard = now = self._state.clock.now()
+        estimator.received_at = now = self._state.clock.now()
         estimator.latency = now - event.stamp
         if estimator.path.due(event.stamp):
             estimator.add(event, self._truth(event))
@@ -195,7 +195,7 @@ class Measured:
             self._images[camera] = collections.deque(maxlen=_IMAGES)
         self._images[camera].append(event)
 
-    # What a snapshot asks.
+    # Parts of a snapshot.
 
     def rows(self) -> list[tuple[object, ...]]:
         """Return the values of the estimators' table."""
@@ -207,7 +207,7 @@ class Measured:
                 estimator.tracking(now),
                 score((name, "ate_rmse")),
                 score((name, "ate_percent")),
-                None if estimator.heard is None else estimator.latency / 1e6,
+                None if estimator.received_at is None else estimator.latency / 1e6,
             )
             for name, estimator in self._estimators.items()
         ]
@@ -215,7 +215,9 @@ class Measured:
     def paths(self) -> dict[str, Points]:
         """Return the paths of vehicles and estimators: metres east, metres north."""
         true = {f"{name}: truth": list(path.points) for name, (path, _) in self._truths.items()}
-        return true | {name: estimator.shown() for name, estimator in self._estimators.items()}
+        return true | {
+            name: estimator.points_to_draw() for name, estimator in self._estimators.items()
+        }
 
     def cameras(self) -> list[str]:
         """Return the cameras that have sent images."""

@@ -111,8 +111,8 @@ class Meter(Instrument):
         They are the time of the loop of each node, without nested calls of others, and the times
         from stamp to delivery of each output's events, by ``node.port``.
         """
-        taken, self._amounts = self._amounts, collections.defaultdict(Amount)
-        return taken
+        amounts, self._amounts = self._amounts, collections.defaultdict(Amount)
+        return amounts
 
     def wrap_call(self, node: str, what: str, call: Call) -> Call:  # noqa: ARG002
         """Return a function to call `call` and add up its durations."""
@@ -120,14 +120,14 @@ class Meter(Instrument):
 
         def metering(argument: Any) -> Any:
             outer, self._inner = self._inner, 0
-            begin = time_ns()
+            start = time_ns()
             try:
                 return call(argument)
             finally:
-                took = time_ns() - begin
-                own = took - self._inner
-                self._inner = outer + took
-                self._amounts[node].add(own, own)
+                duration = time_ns() - start
+                own_time = duration - self._inner
+                self._inner = outer + duration
+                self._amounts[node].add(own_time, own_time)
 
         return metering
 
@@ -153,7 +153,7 @@ class LastRecords(logging.Handler):
         self._numbers = itertools.count()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep a record."""
+        """Store a record."""
         seconds = getattr(record, "seconds", 0.0)
         name = getattr(record, "logger_name", record.name)
         self._lines.append(
@@ -187,13 +187,13 @@ class Observer:
         self._recent = RecentSamples(self._sample())
 
     def begin(self) -> None:
-        """Begin to measure: somebody watches."""
+        """Start measuring, for the first client."""
         if self._meter not in self._supervisor.instruments.attached:
             self._forget()
             self._supervisor.instruments.attach(self._meter)
 
     def end(self) -> None:
-        """Stop measuring: nobody watches."""
+        """Stop measuring, after the last client."""
         if self._meter in self._supervisor.instruments.attached:
             self._supervisor.instruments.detach(self._meter)
             self._forget()
@@ -207,13 +207,13 @@ class Observer:
         stepping, clock = self._supervisor.stepping, self._state.clock
         now, target = sample.run / SECOND, stepping.target_speed
         present = self._recent.run / self._recent.real
-        asked = "as fast as it can" if target is None else f"asked: {target:g}"
+        speed_text = "as fast as it can" if target is None else f"asked: {target:g}"
         duration = float(self._config.run.duration)
         ended, paused = self._state.reason, stepping.state != "running"
         headline = (
             self._config.run.name,
             f"{now:.3f}{f' of {duration:g}' if duration else ''} s",
-            f"{present:.2f} × real time ({'real' if clock.kind == 'real' else asked})",
+            f"{present:.2f} × real time ({'real' if clock.kind == 'real' else speed_text})",
             f"ends: {ended}" if ended else "paused" if paused else "runs",
         )
         return protocol.Snapshot(
@@ -246,7 +246,7 @@ class Observer:
             "settings": (
                 (f"{name}.{key}", value)
                 for name, runner in runners.items()
-                for key, value in self._shown(runner).items()
+                for key, value in self._settings_text(runner).items()
             ),
         }
         return {name: protocol.formatted(name, rows) for name, rows in values.items()}
@@ -262,12 +262,12 @@ class Observer:
             sum(worker.outstanding() for worker in runner.workers) or None,
         )
 
-    def _shown(self, runner: NodeRunner) -> dict[str, str]:
+    def _settings_text(self, runner: NodeRunner) -> dict[str, str]:
         config = runner.node.config if runner.node else runner.spec.config
-        known = self._settings.get(runner.spec.name)
-        if known is None or known[0] is not config:
-            known = self._settings[runner.spec.name] = config, settings(config)
-        return known[1]
+        cached = self._settings.get(runner.spec.name)
+        if cached is None or cached[0] is not config:
+            cached = self._settings[runner.spec.name] = config, settings(config)
+        return cached[1]
 
     def _condition(self, runner: NodeRunner) -> str:
         if runner.restarting:
@@ -302,8 +302,8 @@ class Observer:
         drops = count_drops(self._state)
         for runner in self._state.runners.values():
             for stream in streams(runner.node).values() if runner.node is not None else ():
-                of = drops[stream.name]
-                yield stream.name, stream.statistics().buffered, of.peak, of.bound, of.dropped
+                drop = drops[stream.name]
+                yield stream.name, stream.statistics().buffered, drop.peak, drop.bound, drop.dropped
 
     # Commands.
 

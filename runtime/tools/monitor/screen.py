@@ -77,11 +77,11 @@ class Screen(App[str]):
         self._connection = connection
         self._leave = leave
         self.snapshot: protocol.Snapshot | None = None
-        self._shown = -1
-        self._stop_asked = 0.0
+        self._last_log_line = -1
+        self._stop_pressed_at = 0.0
 
     def compose(self) -> ComposeResult:
-        """Lay the screen out."""
+        """Lay out the screen."""
         yield Static(Text("waiting for the run …"), id="head")
         above, left, right = protocol.STACKS
         yield from map(_table, above)
@@ -134,8 +134,8 @@ class Screen(App[str]):
         paths.update(drawn(snapshot.paths, paths.content_size.width, paths.content_size.height))
         log = self.query_one("#log", RichLog)
         for line in snapshot.log:
-            if line.number > self._shown:
-                self._shown = line.number
+            if line.number > self._last_log_line:
+                self._last_log_line = line.number
                 log.write(Text(line.text, style=_COLOURS.get(line.level, "")), expand=True)
 
     def _fill(self, name: str, snapshot: protocol.Snapshot) -> None:
@@ -183,9 +183,9 @@ class Screen(App[str]):
         if factor is None:
             self._ask(protocol.Speed())
         elif self.snapshot is not None:
-            asked = min(max(self.snapshot.speed * factor, protocol.SLOWEST), protocol.QUICKEST)
-            self._ask(protocol.Speed(factor=asked))
-            self._expect(speed=asked)
+            speed = min(max(self.snapshot.speed * factor, protocol.SLOWEST), protocol.QUICKEST)
+            self._ask(protocol.Speed(factor=speed))
+            self._expect(speed=speed)
 
     def _expect(self, **changes: Any) -> None:
         """Assume a command's effect until the next snapshot, for keys pressed before."""
@@ -200,23 +200,23 @@ class Screen(App[str]):
     def action_stop(self) -> None:
         """End the run, if the key is pressed twice."""
         now = time.monotonic()
-        if now - self._stop_asked < CONFIRM:
+        if now - self._stop_pressed_at < CONFIRM:
             self._ask(protocol.Stop())
         else:
             self.notify("press it again to end the run", severity="warning")
-        self._stop_asked = now
+        self._stop_pressed_at = now
 
     def action_prompt(self) -> None:
         """Ask for a setting of the node under the cursor."""
         if self.snapshot is None:
             return
-        known = ["=".join(row) for row in self.snapshot.tables["settings"]]
+        settings = ["=".join(row) for row in self.snapshot.tables["settings"]]
         prompt = self.query_one("#prompt", Input)
-        prompt.suggester = SuggestFromList(known)
-        mine = [text for text in known if text.startswith(f"{self._selected_node()}.")]
-        prompt.value = mine[0].partition("=")[0] + "=" if mine else ""
+        prompt.suggester = SuggestFromList(settings)
+        of_node = [text for text in settings if text.startswith(f"{self._selected_node()}.")]
+        prompt.value = of_node[0].partition("=")[0] + "=" if of_node else ""
         prompt.cursor_position = len(prompt.value)
-        prompt.placeholder = known[0] if known else "no node has a setting that can change"
+        prompt.placeholder = settings[0] if settings else "no node has a setting that can change"
         prompt.add_class("asking")
         prompt.focus()
 
@@ -266,8 +266,8 @@ def drawn(paths: dict[str, protocol.Points], width: int, height: int) -> Text:
     cells: dict[tuple[int, int], tuple[int, str]] = {}
     for name, path in paths.items():
         at = (np.array(path).reshape(-1, 2) - corner) / metres
-        for begin, end in zip(at[:1].tolist() + at[:-1].tolist(), at.tolist(), strict=True):
-            for x, y in np.rint(np.linspace(begin, end, 2 + int(np.ptp([begin, end], 0).max()))):
+        for start, end in zip(at[:1].tolist() + at[:-1].tolist(), at.tolist(), strict=True):
+            for x, y in np.rint(np.linspace(start, end, 2 + int(np.ptp([start, end], 0).max()))):
                 column, line, dot = int(x) // 2, int(dots[1] - y) // 4, int(dots[1] - y) % 4
                 bit = (1, 2, 4, 64, 8, 16, 32, 128)[int(x) % 2 * 4 + dot]
                 cells[line, column] = (cells.get((line, column), (0, ""))[0] | bit, colours[name])

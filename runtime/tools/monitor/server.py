@@ -42,21 +42,21 @@ MAX_SIDE = 480  # pixels of an encoded image's longer side at most
 QUALITY = 75  # quality of the JPEG, of 100
 
 
-class Kept:
-    """The last result of each of some slow functions, shared by all who ask within its period."""
+class ResultCache:
+    """Cache of slow functions' last results, shared by all clients within a period."""
 
     def __init__(self) -> None:
-        self._made: dict[str, tuple[float, bytes]] = {}
+        self._results: dict[str, tuple[float, bytes]] = {}
         self._lock = threading.Lock()
 
     def get(self, key: str, period: float, make: Callable[[], bytes]) -> bytes:
         """Return the last result of `make`, or a new one if that is as old as the period (s)."""
         with self._lock:
             now = time.monotonic()
-            made, result = self._made.get(key, (-np.inf, b""))
-            if now - made >= period:
+            made_at, result = self._results.get(key, (-np.inf, b""))
+            if now - made_at >= period:
                 result = make()
-                self._made[key] = now, result
+                self._results[key] = now, result
             return result
 
 
@@ -73,7 +73,7 @@ class Server:
         self._changing = threading.Lock()
         self._end = threading.Event()
         self._last = b""
-        self._kept = Kept()
+        self._cache = ResultCache()
         self._failed = False
         # At its final path only once it listens: else others would remove it as a killed run's.
         self._listener = socket.socket(socket.AF_UNIX)
@@ -140,7 +140,7 @@ class Server:
         try:
             while not self._end.wait(PERIOD):
                 try:
-                    line = self._kept.get("", PERIOD / 2, self._snapshot)
+                    line = self._cache.get("", PERIOD / 2, self._snapshot)
                 except CancelledError:
                     break
                 client.sendall(line)
@@ -170,7 +170,7 @@ class Server:
     def _answer(self, request: protocol.Command | protocol.Look) -> protocol.Answer:
         try:
             if isinstance(request, protocol.Look):
-                jpeg = self._kept.get(
+                jpeg = self._cache.get(
                     request.camera, IMAGE_PERIOD, lambda: self._image(request.camera)
                 )
                 return protocol.Answer(done=True, text=request.camera, jpeg=jpeg)
@@ -211,9 +211,9 @@ class Server:
             self._calls.discard(done)
 
 
-def _shut(connection: socket.socket, how: int) -> None:
+def _shut(connection: socket.socket, direction: int) -> None:
     with contextlib.suppress(OSError):
-        connection.shutdown(how)
+        connection.shutdown(direction)
 
 
 def small_jpeg(data: npt.NDArray[np.uint8], features: Sequence[TrackedFeatures] = ()) -> bytes:

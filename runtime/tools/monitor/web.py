@@ -99,8 +99,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _authorize(self, token: str) -> None:
         """Check a request's host and token, or raise `HttpError`."""
         headers = check_headers(self.headers.items(), _ONCE)
-        given = headers.get(TOKEN_HEADER, "") if self.command == "POST" else token
-        if not secrets.compare_digest(given.encode(), self.server.token.encode()):
+        received = headers.get(TOKEN_HEADER, "") if self.command == "POST" else token
+        if not secrets.compare_digest(received.encode(), self.server.token.encode()):
             raise HttpError(403, "expected the address that was printed, token included")
 
     def _body(self) -> bytes:

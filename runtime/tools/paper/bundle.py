@@ -101,7 +101,7 @@ class Estimator(msgspec.Struct, frozen=True, kw_only=True):
     commit: str = ""
 
 
-class Kept(msgspec.Struct, frozen=True):
+class ExcludedFile(msgspec.Struct, frozen=True):
     """A file of the run's folder that is not in the archive."""
 
     path: str
@@ -137,7 +137,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     programs: tuple[Program, ...]
     made_from: Parts
     files: dict[str, str]
-    left_out: tuple[Kept, ...]
+    left_out: tuple[ExcludedFile, ...]
     notes: tuple[str, ...]
 
 
@@ -177,7 +177,7 @@ def write_bundle(folder: Path, out: Path, *, with_inputs: bool = False) -> Manif
         entries["figures.csv"] = _figures(summary)
     programs = tuple(_programs(config))
     left_out = tuple(
-        Kept(path.relative_to(folder).as_posix(), path.stat().st_size, sha256(path))
+        ExcludedFile(path.relative_to(folder).as_posix(), path.stat().st_size, sha256(path))
         for path in _files(folder)
         if path.relative_to(folder).as_posix() not in {*entries, *_MADE}
     )
@@ -330,7 +330,7 @@ def _notes(
     summary: Summary,
     files: Sequence[InputFile],
     programs: Sequence[Program],
-    left_out: Sequence[Kept],
+    left_out: Sequence[ExcludedFile],
     entries: Entries,
 ) -> Iterator[str]:
     if summary.digest is None:
@@ -364,7 +364,7 @@ def _notes(
         yield f"it has no plots: `python -m runtime report {folder}` draws them, before a bundle"
 
 
-def _listed(files: Sequence[InputFile | Kept]) -> str:
+def _listed(files: Sequence[InputFile | ExcludedFile]) -> str:
     names = [f"{Path(file.path).name} ({size_of(file.size)})" for file in files]
     return ", ".join(names[:5]) + f" and {len(names) - 5} more" * (len(names) > 5)
 

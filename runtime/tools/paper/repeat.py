@@ -157,8 +157,8 @@ def configuration(bundle: Bundle, overrides: Sequence[str] = ()) -> tuple[Config
         override(changed, change)
     config = parse(changed, str(bundle.path))
     _as_written(config.run, table.get("run", {}))
-    for spec, own in zip(config.nodes, table["nodes"], strict=True):
-        _as_written(spec.config, own)
+    for spec, row in zip(config.nodes, table["nodes"], strict=True):
+        _as_written(spec.config, row)
     notes = []
     places: dict[str, list[Path]] = {}
     for setting, files in inputs_of(config):
@@ -166,15 +166,15 @@ def configuration(bundle: Bundle, overrides: Sequence[str] = ()) -> tuple[Config
     for file in bundle.manifest.inputs:
         paths = places.get(file.setting, [])
         path = paths.pop(0) if paths else Path(moved.get(file.path, file.path))
-        wanted = f"{size_of(file.size)}, sha256 {file.sha256[:16]}…"
+        expected = f"{size_of(file.size)}, sha256 {file.sha256[:16]}…"
         if not path.exists():
             raise ResultsError(
-                f"{file.setting}: expected {path} ({wanted}), found none: say where it is with "
+                f"{file.setting}: expected {path} ({expected}), found none: say where it is with "
                 f"--set {file.setting}=PATH"
             )
-        if (here := sha256(path)) != file.sha256:
-            notes.append(f"{file.setting}: {path} is not that of the bundle: expected {wanted}, "
-                         f"found sha256 {here[:16]}…")  # fmt: skip
+        if (actual := sha256(path)) != file.sha256:
+            notes.append(f"{file.setting}: {path} is not that of the bundle: expected {expected}, "
+                         f"found sha256 {actual[:16]}…")  # fmt: skip
     return config, notes
 
 

@@ -33,16 +33,16 @@ class Watch:
     """Base of a sweep's observers: does nothing."""
 
     def begin(self, missing: Sequence[Job], finished: int) -> None:
-        """Note the jobs to run, and the number of runs finished earlier."""
+        """Handle the start: the jobs to run, and the number of runs finished earlier."""
 
     def again(self, changed: Mapping[Job, Sequence[str]]) -> None:
-        """Note the finished jobs to run again, with what has changed; called before `begin`."""
+        """Handle finished jobs to run again, with what has changed; called before `begin`."""
 
     def done(self, job: Job, row: Row) -> None:
-        """Note the end of a run, successful or not."""
+        """Handle the end of a run, successful or not."""
 
     def interrupted(self) -> None:
-        """Note an interruption: the sweep ends after the running jobs; end them soon."""
+        """Handle an interruption: the sweep ends after the running jobs, which should end soon."""
 
 
 def sweep(
@@ -72,16 +72,16 @@ def sweep(
             ended; those that ended well are kept. A second one is not waited for.
     """
     watch = watch or Watch()
-    now = parts_of(plan)
+    parts = parts_of(plan)
     with Rows(plan.out / "rows.jsonl", fresh=fresh) as rows:
         missing, changed = [], {}
         for job in plan.jobs:
             row = rows.get(job)
             if row is None or row["error"]:
                 missing.append(job)
-            elif why := rows.changes(row, now[job.roots]):
+            elif reasons := rows.changes(row, parts[job.roots]):
                 missing.append(job)
-                changed[job] = why
+                changed[job] = reasons
         if changed:
             watch.again(changed)
         watch.begin(missing, len(plan.jobs) - len(missing))
@@ -91,15 +91,15 @@ def sweep(
                 futures[_submit(executor, run, job)] = job
             for future in concurrent.futures.as_completed([*futures]):
                 job = futures[future]
-                row = rows.add(_with_parts(_row(future, job), now[job.roots]))
+                row = rows.add(_with_parts(_row(future, job), parts[job.roots]))
                 watch.done(futures.pop(future), row)
         except BaseException:
-            left = [future for future in futures if not future.cancel()]
+            running = [future for future in futures if not future.cancel()]
             watch.interrupted()
-            for row in [_row(future, futures[future]) for future in left]:  # waits
+            for row in [_row(future, futures[future]) for future in running]:  # waits
                 if not row["error"]:
                     job = next(planned for planned in plan.jobs if planned.id == row["id"])
-                    rows.add(_with_parts(row, now[job.roots]))
+                    rows.add(_with_parts(row, parts[job.roots]))
             raise
         return [row for job in plan.jobs if (row := rows.get(job)) is not None]
 
@@ -128,7 +128,7 @@ def run_here(
     children, watch = (display.children, display) if display else (Children(), Watch())
     if display is None:
         watch.interrupted = children.interrupt  # type: ignore[method-assign]
-        watch.again = lambda changed: _LOG.warning("%s", words(changed))  # type: ignore[method-assign]
+        watch.again = lambda changed: _LOG.warning("%s", rerun_text(changed))  # type: ignore[method-assign]
     with concurrent.futures.ThreadPoolExecutor(jobs or at_once(plan), "run") as executor:
         return sweep(plan, executor, run=children.run, watch=watch, fresh=fresh)
 
@@ -170,15 +170,15 @@ class Display(Watch):
     def __init__(
         self, console: Console, finished: Callable[[Job, Row], None] | None = None
     ) -> None:
-        self._tell = finished
+        self._finished_callback = finished
         self.children = Children()
         self.crashed = 0
         self.finished = 0
         self._console = console
         self._missing = 0
-        self._again: Mapping[Job, Sequence[str]] = {}
+        self._changed: Mapping[Job, Sequence[str]] = {}
         self._usage, self._looked = (0, 0.0), 0.0
-        self._begin = self._last = time.monotonic()
+        self._started_at = self._last_end = time.monotonic()
         self._bar = Progress(
             TextColumn("sweep"),
             BarColumn(),
@@ -200,27 +200,27 @@ class Display(Watch):
     def begin(self, missing: Sequence[Job], finished: int) -> None:
         """Show how many runs there are."""
         self._missing = len(missing)
-        self._begin = self._last = time.monotonic()
-        new = len(missing) - len(self._again)
-        if self._again:
+        self._started_at = self._last_end = time.monotonic()
+        new = len(missing) - len(self._changed)
+        if self._changed:
             to_do = f"{new} to do, " * (new > 0)
-            self._print(f"{finished} runs are finished already, {to_do}{words(self._again)}")
+            self._print(f"{finished} runs are finished already, {to_do}{rerun_text(self._changed)}")
         elif finished:
             self._print(f"{finished} runs are finished already, {new} to do")
-        self._again = {}  # for another sweep
+        self._changed = {}  # for another sweep
         self._bar.update(self._task, total=len(missing))
 
     def again(self, changed: Mapping[Job, Sequence[str]]) -> None:
         """Remember which finished runs are run again, and why; `begin` prints it."""
-        self._again = changed
+        self._changed = changed
 
     def done(self, job: Job, row: Row) -> None:
         """Count a run; print failures, and without a bar every run."""
-        if self._tell is not None:
-            self._tell(job, row)
+        if self._finished_callback is not None:
+            self._finished_callback(job, row)
         self.finished += 1
         self.crashed += bool(row["error"])
-        self._last = time.monotonic()
+        self._last_end = time.monotonic()
         self._bar.update(self._task, completed=self.finished)
         if row["error"]:
             self._print(f"{self._count()} {job}: crashed: {row['error']}")
@@ -229,8 +229,8 @@ class Display(Watch):
             failed = ", failed" if row["passed"] is False else ""
             self._print(f"{self._count()} {job}: {seconds}{failed}, {self.state()}")
         if edited := row.get("edited"):
-            what = listed([f"{part} while it ran" for part in edited])
-            self._print(f"warning: {job}: {what}: the next call runs it again")
+            changes = listed([f"{part} while it ran" for part in edited])
+            self._print(f"warning: {job}: {changes}: the next call runs it again")
 
     def interrupted(self) -> None:
         """Print a notice: running jobs are awaited, Ctrl-C ends them at once."""
@@ -238,16 +238,16 @@ class Display(Watch):
 
     def state(self) -> str:
         """Return failures, running jobs with processes and memory, and the time left."""
-        left = "?"
+        remaining = "?"
         if self.finished:
-            pace = (self._last - self._begin) / self.finished
-            until = self._last + pace * (self._missing - self.finished)
-            left = _clock(max(until - time.monotonic(), 0))
+            pace = (self._last_end - self._started_at) / self.finished
+            until = self._last_end + pace * (self._missing - self.finished)
+            remaining = _clock(max(until - time.monotonic(), 0))
         if time.monotonic() - self._looked > 1.0:
             self._usage, self._looked = self.children.usage(), time.monotonic()
         processes, memory = self._usage
         using = f" ({processes} process{'es' * (processes > 1)}, {memory:.1f} GB)" * bool(processes)
-        return f"{self.crashed} crashed, {len(self.children)} running{using}, {left} left"
+        return f"{self.crashed} crashed, {len(self.children)} running{using}, {remaining} left"
 
     def _count(self) -> str:
         return f"{self.finished}/{self._missing}"
@@ -256,9 +256,9 @@ class Display(Watch):
         self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-def words(changed: Mapping[Job, Sequence[str]]) -> str:
+def rerun_text(changed: Mapping[Job, Sequence[str]]) -> str:
     """Return which finished runs are run again, and why: ``2 are run again: x.py changed``."""
-    reasons = [reason for why in changed.values() for reason in why]
+    reasons = [reason for change_reasons in changed.values() for reason in change_reasons]
     are = "is" if len(changed) == 1 else "are"
     return f"{len(changed)} {are} run again: {listed(dict.fromkeys(reasons))}"
 

@@ -64,13 +64,13 @@ def draw_plots(plan: Plan, rows: Sequence[Row]) -> list[Path]:
 
 def figures_of(plan: Plan, rows: Sequence[Row]) -> Iterator[tuple[str, Figure]]:
     """Yield a name for files and the plot of each parameter, as `draw_plots` draws it."""
-    own = [row for _, row in in_order(plan, rows)]
+    job_rows = [row for _, row in in_order(plan, rows)]
     for parameter in plan.parameters:
-        by_figure = {name: lines(plan, own, parameter, name) for name in PLOTTED}
+        by_figure = {name: lines(plan, job_rows, parameter, name) for name in PLOTTED}
         by_figure = {name: curves for name, curves in by_figure.items() if any(map(_seen, curves))}
         if by_figure and len(parameter.texts) > 1:
             name = re.sub(r"[^\w.-]", "_", parameter.path)
-            yield name, _draw(parameter, by_figure, _shares(parameter, own))
+            yield name, _draw(parameter, by_figure, _shares(parameter, job_rows))
 
 
 def lines(plan: Plan, rows: Sequence[Row], parameter: Parameter, figure: str) -> list[Line]:
@@ -85,18 +85,20 @@ def lines(plan: Plan, rows: Sequence[Row], parameter: Parameter, figure: str) ->
     samples: list[tuple[str, str, str, float]] = []
     for job, row in in_order(plan, rows):
         settings = dict(job.settings)
-        here = settings.pop(parameter.path)
-        others = ", ".join(f"{short[path]}={text}" for path, text in settings.items())
+        value = settings.pop(parameter.path)
+        label_rest = ", ".join(f"{short[path]}={text}" for path, text in settings.items())
         for estimator, figures in row["estimators"].items():
             name = f"{estimator} ({figures.get('alignment', 'none')})" if aligned else estimator
-            samples += [(name, others, here, number) for number in numbers([figures.get(figure)])]
+            samples += [
+                (name, label_rest, value, number) for number in numbers([figures.get(figure)])
+            ]
     several = len({name for name, *_ in samples}) > 1
-    if len({(name, others) for name, others, *_ in samples}) > _MOST_LINES:
-        several, samples = True, [(name, "all others", here, n) for name, _, here, n in samples]
+    if len({(name, label_rest) for name, label_rest, *_ in samples}) > _MOST_LINES:
+        several, samples = True, [(name, "all others", value, n) for name, _, value, n in samples]
     points: dict[str, dict[str, list[float]]] = {}
-    for name, others, here, number in samples:
-        label = ", ".join(filter(None, (name * several, others)))
-        points.setdefault(label, {}).setdefault(here, []).append(number)
+    for name, label_rest, value, number in samples:
+        label = ", ".join(filter(None, (name * several, label_rest)))
+        points.setdefault(label, {}).setdefault(value, []).append(number)
     return [_line(label, line, parameter) for label, line in points.items()]
 
 
@@ -139,12 +141,12 @@ def _draw(
     panels = len(lines) + bool(shares)
     columns, rows = min(panels, _ACROSS), math.ceil(panels / _ACROSS)
     figure = Figure(figsize=(4.6 * columns, 3.4 * rows), layout="constrained")
-    labels = list(dict.fromkeys(line.label for own in lines.values() for line in own))
+    labels = list(dict.fromkeys(line.label for group in lines.values() for line in group))
     colours = {label: f"C{index}" for index, label in enumerate(labels)}
     handles: dict[str, Any] = {}
-    for index, (name, own) in enumerate([*lines.items(), *[("", [])] * bool(shares)], 1):
+    for index, (name, group) in enumerate([*lines.items(), *[("", [])] * bool(shares)], 1):
         axes: Any = figure.add_subplot(rows, columns, index)
-        for line in own:
+        for line in group:
             points = sorted(
                 (place[text], (s.median, s.first, s.third, s.least, s.most))
                 for text, s in zip(line.texts, line.spreads, strict=True)
@@ -157,15 +159,15 @@ def _draw(
             axes.errorbar(
                 x, middle, (middle - least, most - middle), fmt="none", ecolor=colour, capsize=3
             )
-        highest = max((s.most for line in own for s in line.spreads), default=100.0)
-        if not own:
+        highest = max((s.most for line in group for s in line.spreads), default=100.0)
+        if not group:
             for style, (label, percent) in zip(("s-", "^--"), shares.items(), strict=True):
                 x, y = np.array(sorted(zip(scale.places, percent, strict=True))).T
                 axes.plot(x, y, style, color="#b00020", label=label)
             axes.set_ylim(-4, 125)  # with room for the legend
             axes.set_yticks(range(0, 101, 20))
             axes.legend(fontsize=8, loc="upper left", ncols=2)
-        elif decades([v for line in own for s in line.spreads for v in (s.least, s.most)]):
+        elif decades([v for line in group for s in line.spreads for v in (s.least, s.most)]):
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter("{x:g}")
         else:

@@ -88,9 +88,13 @@ class Children:
         if job.flight:
             command += ["--flight", "record" if job.record else "use"]
         paths = [os.environ.get("PYTHONPATH", ""), job.folder]
-        begin = time.monotonic()
-        lifeline, ours = os.pipe()  # whose other end the kernel closes, however we end
-        with (out / "output.txt").open("wb") as output, os.fdopen(lifeline), os.fdopen(ours, "w"):
+        start = time.monotonic()
+        lifeline, own_end = os.pipe()  # whose other end the kernel closes, however we end
+        with (
+            (out / "output.txt").open("wb") as output,
+            os.fdopen(lifeline),
+            os.fdopen(own_end, "w"),
+        ):
             with self._lock:
                 if self.ending:
                     return crashed(job, "not started")
@@ -115,7 +119,7 @@ class Children:
                 kill_tree(child.pid)
                 row = crashed(job, f"timed out after {job.limit:g} s")
                 row["exit_code"] = child.wait()
-                row["wall_seconds"] = round(time.monotonic() - begin, 6)
+                row["wall_seconds"] = round(time.monotonic() - start, 6)
                 return row
             except BaseException:
                 child.send_signal(signal.SIGINT)
@@ -124,10 +128,10 @@ class Children:
             finally:
                 with self._lock:
                     self._running.discard(child)
-        return read_results(job, code, time.monotonic() - begin)
+        return read_results(job, code, time.monotonic() - start)
 
     def interrupt(self) -> None:
-        """Let all running ones end in order, and start no more; called again, end them at once."""
+        """Interrupt all running processes, and start no more; called again, kill them."""
         with self._lock:
             for child in self._running:
                 if not self.ending:
@@ -221,7 +225,7 @@ def read_results(job: Job, code: int, wall_seconds: float) -> Row:
     if ended is not None:
         row["sim_seconds"], row["run_seconds"] = ended.sim_seconds, ended.wall_seconds
         row["workers"] = ended.workers
-        note_inputs(row, ended)
+        add_inputs(row, ended)
         row["digest"] = None if ended.not_deterministic else ended.digest
         if ended.reason in _STOPPED:
             row["error"] = f"interrupted by {ended.reason}"
@@ -230,15 +234,15 @@ def read_results(job: Job, code: int, wall_seconds: float) -> Row:
         row["passed"], row["estimators"] = verdict.passed, verdict.estimators
         row["flights"] = verdict.flights
         row["digests"] = {
-            name: combined(own)
+            name: combined(outputs)
             for name in verdict.estimators
-            if (own := _outputs_of(name.partition("/")[0], ended.digests))
+            if (outputs := _outputs_of(name.partition("/")[0], ended.digests))
         }
     return row
 
 
-def note_inputs(row: Row, ended: Ended) -> None:
-    """Note in a row what estimators were fed, if that is known."""
+def add_inputs(row: Row, ended: Ended) -> None:
+    """Add the fingerprints of the estimators' inputs to a row, if known."""
     row["name"] = ended.name
     if ended.inputs_digest is not None:
         row["inputs"] = ended.inputs

@@ -87,15 +87,12 @@ def decode_rows(text: bytes) -> dict[str, Row]:
     rows: dict[str, Row] = {}
     for line in text.splitlines():
         with contextlib.suppress(msgspec.MsgspecError):
-            _enter(rows, msgspec.json.decode(line, type=Row))
+            _replace(rows, msgspec.json.decode(line, type=Row))
     return rows
 
 
-def _enter(rows: dict[str, Row], row: Row) -> Row:
-    """Let a row take the place of its job's earlier one, whose crash it remembers.
-
-    Crashes of other code than today's are none of its: what was mended has not crashed.
-    """
+def _replace(rows: dict[str, Row], row: Row) -> Row:
+    """Replace a job's earlier row; the new row lists that one's crash, if of the same code."""
     earlier = rows.get(row["id"])
     keys = {entry["made_from"] for entry in (earlier, row) if entry and "made_from" in entry}
     if earlier is not None and len(keys) < 2:
@@ -152,7 +149,7 @@ class Rows:
     def changes(self, row: Row, now: Parts) -> list[str]:
         """Return what a run was made from that is different now, in words; nothing if it is valid.
 
-        Of a run that nothing is known of, such as one of an earlier version, that is said.
+        A run without a record, such as one of an earlier version, counts as changed.
         """
         if edited := row.get("edited"):
             return [f"{part} while it ran" for part in edited]
@@ -172,7 +169,7 @@ class Rows:
         line = msgspec.json.encode(row)
         self._file.write(line + b"\n")
         self._file.flush()
-        return _enter(self._rows, msgspec.json.decode(line, type=Row))
+        return _replace(self._rows, msgspec.json.decode(line, type=Row))
 
 
 class _Set(msgspec.Struct):
@@ -186,8 +183,8 @@ def _decode_parts(path: Path) -> dict[str, Parts]:
     parts: dict[str, Parts] = {}
     for line in path.read_bytes().splitlines() if path.is_file() else ():
         with contextlib.suppress(msgspec.MsgspecError):  # cut short, or empty
-            one = msgspec.json.decode(line, type=_Set)
-            parts[one.key] = one.parts
+            entry = msgspec.json.decode(line, type=_Set)
+            parts[entry.key] = entry.parts
     return parts
 
 
@@ -251,11 +248,11 @@ class Combination(msgspec.Struct, frozen=True, kw_only=True):
 
 def write_tables(plan: Plan, rows: Sequence[Row]) -> None:
     """Write the four tables into the plan's folder; rows of other plans are left out."""
-    own = in_order(plan, rows)
+    jobs = in_order(plan, rows)
     paths = [p.path for p in plan.parameters]
-    head = ["run", *paths, "seed", *["repeat"] * any(job.repeat > 1 for job, _ in own)]
+    head = ["run", *paths, "seed", *["repeat"] * any(job.repeat > 1 for job, _ in jobs)]
     runs: list[dict[str, Any]] = [
-        {**row, "run": job.id, "repeat": job.repeat, **dict(job.settings)} for job, row in own
+        {**row, "run": job.id, "repeat": job.repeat, **dict(job.settings)} for job, row in jobs
     ]
     times = ["wall_seconds", "run_seconds", "sim_seconds"]
     _write(plan.out / "timing.csv", [*head, *times], runs)
@@ -265,11 +262,11 @@ def write_tables(plan: Plan, rows: Sequence[Row]) -> None:
         for name, costs in run.get("workers", {}).items()
     ]
     keys = dict.fromkeys(
-        key for _, row in own for c in row.get("workers", {}).values() for key in c
+        key for _, row in jobs for c in row.get("workers", {}).values() for key in c
     )
     _write(plan.out / "costs.csv", [*head, "worker", *keys], costs)
     head += ["exit_code", "error", "passed", "sim_seconds", "digest", "estimator"]
-    present = {key for _, row in own for figures in row["estimators"].values() for key in figures}
+    present = {key for _, row in jobs for figures in row["estimators"].values() for key in figures}
     first = [name for name in ("alignment", *IN_SWEEPS) if name in present]
     columns = {
         name: f"estimator_{name}" if name in head else name
@@ -282,15 +279,15 @@ def write_tables(plan: Plan, rows: Sequence[Row]) -> None:
     ]
     _write(plan.out / "table.csv", [*head, *columns.values()], table)
     head = [*paths, "estimator", "alignment", "runs", "crashed", "failed", "passed", "repeatable"]
-    head += [f"{name}_{what}" for name in IN_SWEEPS for what in SPREAD]
+    head += [f"{name}_{statistic}" for name in IN_SWEEPS for statistic in SPREAD]
     summary = [
         {
             **msgspec.structs.asdict(combination),
             **dict(zip(paths, combination.settings, strict=True)),
             **{
-                f"{name}_{what}": getattr(spread, field)
+                f"{name}_{statistic}": getattr(spread, field)
                 for name, spread in combination.figures.items()
-                for what, field in SPREAD.items()
+                for statistic, field in SPREAD.items()
             },
         }
         for combination in summarise(plan, rows)
@@ -320,33 +317,35 @@ def plan_from(rows: Iterable[Row], out: Path) -> tuple[Plan, list[Row]]:
 
     Of a folder with several sweeps it is that of the runs that vary the same as the last one.
     """
-    own = [*rows]
-    own = [row for row in own if row["parameters"].keys() == own[-1]["parameters"].keys()]
+    matching = [*rows]
+    matching = [
+        row for row in matching if row["parameters"].keys() == matching[-1]["parameters"].keys()
+    ]
     jobs = [
         Job(
             id=row["id"], text="", folder="", settings=tuple(row["parameters"].items()),
             seed=row["seed"], out="", repeat=row.get("repeat", 1),
         )
-        for row in own
+        for row in matching
     ]  # fmt: skip
-    return Plan(jobs=tuple(jobs), out=out), own
+    return Plan(jobs=tuple(jobs), out=out), matching
 
 
 def in_order(plan: Plan, rows: Iterable[Row]) -> list[tuple[Job, Row]]:
     """Return the rows of a plan's jobs, in their order."""
-    known = {row["id"]: row for row in rows}
-    return [(job, known[job.id]) for job in plan.jobs if job.id in known]
+    by_id = {row["id"]: row for row in rows}
+    return [(job, by_id[job.id]) for job in plan.jobs if job.id in by_id]
 
 
 def summarise(
     plan: Plan, rows: Iterable[Row], wanted: Sequence[str] = IN_SWEEPS
 ) -> list[Combination]:
     """Sum up the seeds of each combination and estimator, in a stable order."""
-    own = in_order(plan, rows)
+    jobs = in_order(plan, rows)
     groups: dict[tuple[str, ...], list[Row]] = {}
-    for job, row in own:
+    for job, row in jobs:
         groups.setdefault(tuple(text for _, text in job.settings), []).append(row)
-    names = list(dict.fromkeys(name for _, row in own for name in row["estimators"]))
+    names = list(dict.fromkeys(name for _, row in jobs for name in row["estimators"]))
     return [
         combine(settings, name, group, wanted)
         for settings, group in groups.items()
@@ -370,8 +369,8 @@ def combine(
     passed = [f["passed"] for f in figures if isinstance(f.get("passed"), bool)]
     values = {figure: numbers(f.get(figure) for f in figures) for figure in wanted}
     reasons: dict[str, str] = {}
-    for row, own in zip(group, figures, strict=True):
-        for reason in map(str, filter(None, [row["error"], *(own.get("failed") or [])])):
+    for row, figures_of_row in zip(group, figures, strict=True):
+        for reason in map(str, filter(None, [row["error"], *(figures_of_row.get("failed") or [])])):
             reasons.setdefault(reason.partition(":")[0], reason)
     return Combination(
         settings=settings, estimator=name,
@@ -384,17 +383,17 @@ def combine(
 
 
 def _repeatable(name: str, group: Sequence[Row]) -> str:
-    """Say whether an estimator gave the same whenever settings and seed were the same."""
+    """Return whether an estimator gave equal outputs for equal settings and seed, as text."""
     seeds: dict[int, list[Row]] = {}
     for row in group:
         if name in row.get("digests", {}):
             seeds.setdefault(row["seed"], []).append(row)
-    several = [rows for rows in seeds.values() if len(rows) > 1]
-    if not several:
+    repeated = [rows for rows in seeds.values() if len(rows) > 1]
+    if not repeated:
         return ""
-    differing = [rows for rows in several if len({row["digests"][name] for row in rows}) > 1]
+    differing = [rows for rows in repeated if len({row["digests"][name] for row in rows}) > 1]
     if not differing:
-        runs = sum(map(len, several))
+        runs = sum(map(len, repeated))
         return f"{runs} of {runs} equal"
     errors = [numbers(r["estimators"][name].get("ate_percent") for r in rows) for rows in differing]
     least, most = max(

@@ -63,7 +63,7 @@ class EventNote(NamedTuple):
         run: Of sending, the run's clock (ns).
         sender: ``node.port``.
         identity: Its `id`.
-        given: The `id` of the event that the step which sent it was handling; 0 if none.
+        cause_id: The `id` of the event that the step which sent it was handling; 0 if none.
     """
 
     time: int
@@ -73,11 +73,11 @@ class EventNote(NamedTuple):
     source: str
     stamp: int
     identity: int
-    given: int
+    cause_id: int
 
 
 class ClockRate(NamedTuple):
-    """How the run's clock follows real time; `run` of a note is then real time, too.
+    """Relation of the run's clock to real time; `run` of a note is then real time, too.
 
     Attributes:
         origin: When the run's clock showed 0.
@@ -101,7 +101,7 @@ class Spool:
     Attributes:
         beside: Notes of other threads than the loop's.
         kinds: What is known of each type of event, by name.
-        receivers: Nodes that hear events of a sender, type and source.
+        receivers: Nodes that receive events of a sender, type and source.
     """
 
     def __init__(self, path: Path) -> None:
@@ -119,8 +119,8 @@ class Spool:
         self._thread = RunThread(target=self._write, name="trace", daemon=True)
         self._thread.start()
 
-    def put(self, notes: list[tuple[Any, ...]]) -> None:
-        """Take a list of notes, in the order of their making."""
+    def add(self, notes: list[tuple[Any, ...]]) -> None:
+        """Write a list of notes, ordered by time."""
         self._lists.put(notes)
 
     def close(self) -> None:
@@ -149,7 +149,7 @@ class Spool:
         if self.failed is None:
             try:
                 self._append(notes)
-            except OSError as error:  # a full disk, which must not spoil the run
+            except OSError as error:  # a full disk must not end the run
                 self.failed = error
                 log.warning("no trace from here on: %s", error)
 
@@ -161,9 +161,9 @@ class Spool:
 
     def _append(self, notes: list[tuple[Any, ...]]) -> None:
         content = self._encode([self._plain(n) if n[0] == "event" else n for n in notes])
-        rest = memoryview(len(content).to_bytes(_LENGTH_BYTES, "little") + content)
-        while rest:
-            rest = rest[self._file.write(rest) :]
+        remaining = memoryview(len(content).to_bytes(_LENGTH_BYTES, "little") + content)
+        while remaining:
+            remaining = remaining[self._file.write(remaining) :]
 
     def _plain(self, note: tuple[Any, ...]) -> tuple[Any, ...]:
         _, time, run, sender, event, source, stamp, identity, cause, listeners = note
@@ -219,7 +219,7 @@ class TraceInstrument(Instrument):
 
         def noting(argument: Any) -> Any:
             before = current[0]
-            # A tick, say, may lie where an event lay before.
+            # A tick may have the `id` of a deleted event.
             current[0] = cause = identity(argument) if isinstance(argument, Event) else 0
             run, begin = now(), time_ns()
             try:
@@ -258,7 +258,7 @@ class TraceInstrument(Instrument):
 
     def wrap_offload(self, node: str, call: Callable[[], Any], name: str) -> Callable[[], Any]:
         """Return a function to call `call` and note its run in a thread."""
-        submitted, note = time.perf_counter_ns(), self.beside.append
+        submitted, add_note = time.perf_counter_ns(), self.beside.append
 
         def noting() -> Any:
             begin = time.perf_counter_ns()
@@ -266,35 +266,35 @@ class TraceInstrument(Instrument):
                 return call()
             finally:
                 thread = threading.current_thread().name
-                note(("thread", thread, node, name, submitted, begin, time.perf_counter_ns()))
+                add_note(("thread", thread, node, name, submitted, begin, time.perf_counter_ns()))
 
         return noting
 
     def worker_called(
         self, process: str, method: str, answer: concurrent.futures.Future[Any]
     ) -> None:
-        """Note a worker's call once answered."""
+        """Record a worker's call once answered."""
         asked = time.perf_counter_ns()
         answer.add_done_callback(
             lambda _: self.beside.append(("worker", process, method, asked, time.perf_counter_ns()))
         )
 
     def close(self) -> None:
-        """Hand over the remaining notes, while the run's clock still goes."""
+        """Write the remaining notes, while the run's clock still runs."""
         if isinstance(self._clock, RealClock):
             real, run, speed = time.perf_counter_ns(), self._clock.now(), self._clock.speed
             self._spool.rate = ClockRate(round(real - run / speed), speed)
         self._flush()
 
     def _flush(self) -> None:
-        self._spool.put(self._notes.copy())
+        self._spool.add(self._notes.copy())
         self._notes.clear()
 
 
 REMEMBERED = 512  # how many stamps of received events are kept per node
 IDENTITIES = 8192  # how many events are kept by identity
 
-How = Literal["begins", "follows", "holds"]
+Relation = Literal["begins", "follows", "holds"]
 
 
 class SentEvent(msgspec.Struct, eq=False):
@@ -303,8 +303,8 @@ class SentEvent(msgspec.Struct, eq=False):
     Attributes:
         time: Of `time.perf_counter_ns`, when it was sent.
         node: Sender.
-        seen: Whether its path begins with a camera.
-        how: ``begins`` a path, ``follows`` from `cause`, or ``holds`` it at best.
+        from_camera: Whether its path begins with a camera.
+        relation: ``begins`` a path, ``follows`` from `cause`, or ``holds`` it at best.
         cause: The event that it follows from.
     """
 
@@ -314,8 +314,8 @@ class SentEvent(msgspec.Struct, eq=False):
     event: str
     source: str
     stamp: int
-    seen: bool = False
-    how: How = "begins"
+    from_camera: bool = False
+    relation: Relation = "begins"
     cause: SentEvent | None = None
 
     def path(self) -> list[SentEvent]:
@@ -328,7 +328,7 @@ class SentEvent(msgspec.Struct, eq=False):
         return events[::-1]
 
 
-class _HeardEvents:
+class _ReceivedEvents:
     def __init__(self) -> None:
         self.by_stamp: OrderedDict[int, list[SentEvent]] = OrderedDict()
         self.newest: SentEvent | None = None
@@ -337,13 +337,13 @@ class _HeardEvents:
         self.by_stamp.setdefault(sent.stamp, []).append(sent)
         if len(self.by_stamp) > REMEMBERED:
             self.by_stamp.popitem(last=False)
-        if sent.seen or self.newest is None or not self.newest.seen:
+        if sent.from_camera or self.newest is None or not self.newest.from_camera:
             self.newest = sent
 
     def of_stamp(self, stamp: int) -> Iterator[SentEvent]:
         """Yield the events with this stamp, the most likely cause first."""
         yield from sorted(
-            self.by_stamp.get(stamp, ()), key=lambda s: (s.seen, s.time), reverse=True
+            self.by_stamp.get(stamp, ()), key=lambda s: (s.from_camera, s.time), reverse=True
         )
 
 
@@ -361,7 +361,7 @@ class Causes:
     ) -> None:
         self._kinds = kinds
         self._receivers = receivers
-        self._heard: dict[str, _HeardEvents] = {}
+        self._received: dict[str, _ReceivedEvents] = {}
         self._by_identity: OrderedDict[int, tuple[SentEvent, tuple[str, ...]]] = OrderedDict()
         """Events with their receiving nodes, by `id`."""
 
@@ -369,10 +369,10 @@ class Causes:
         """Add the next event, and return the event with its cause."""
         node, kind = note.sender.partition(".")[0], self._kinds[note.event]
         sent = SentEvent(note.time, note.run, node, note.event, note.source, note.stamp)
-        # Another event may lie where one lay that has come from elsewhere.
-        cause, heard = self._by_identity.get(note.given, (None, ()))
-        self._trace_back(sent, kind, cause if node in heard else None)
-        sent.seen = kind.image if sent.cause is None else sent.cause.seen
+        # An `id` may belong to an earlier, deleted event.
+        cause, receivers_of_cause = self._by_identity.get(note.cause_id, (None, ()))
+        self._trace_back(sent, kind, cause if node in receivers_of_cause else None)
+        sent.from_camera = kind.image if sent.cause is None else sent.cause.from_camera
         receivers = self._receivers.get((note.sender, note.event, note.source), ())
         self._by_identity[note.identity] = sent, receivers
         self._by_identity.move_to_end(note.identity)
@@ -381,27 +381,29 @@ class Causes:
         if not kind.setpoint and (kind.measured or sent.cause is not None):
             for receiver in receivers:
                 if receiver != node:
-                    self._heard.setdefault(receiver, _HeardEvents()).add(sent)
+                    self._received.setdefault(receiver, _ReceivedEvents()).add(sent)
         return sent
 
-    def _trace_back(self, sent: SentEvent, kind: EventKind, given: SentEvent | None) -> None:
-        past = self._heard.get(sent.node) or _HeardEvents()
-        if given is not None and (given.node == sent.node or not self._leads_anywhere(given)):
-            given = None
-        followed: list[SentEvent] = []
-        if not kind.setpoint:  # whose stamp is when it was sent, and tells nothing
-            if given is not None and given.stamp == sent.stamp:
-                followed.append(given)
-            followed += past.of_stamp(sent.stamp)
-        if given is not None and not kind.measured:
-            followed.append(given)
-        for cause in followed:
+    def _trace_back(self, sent: SentEvent, kind: EventKind, candidate: SentEvent | None) -> None:
+        past = self._received.get(sent.node) or _ReceivedEvents()
+        if candidate is not None and (
+            candidate.node == sent.node or not self._leads_anywhere(candidate)
+        ):
+            candidate = None
+        candidates: list[SentEvent] = []
+        if not kind.setpoint:  # a set-point's stamp is its time of sending
+            if candidate is not None and candidate.stamp == sent.stamp:
+                candidates.append(candidate)
+            candidates += past.of_stamp(sent.stamp)
+        if candidate is not None and not kind.measured:
+            candidates.append(candidate)
+        for cause in candidates:
             if _passes(cause, sent.node):
-                sent.cause, sent.how = cause, "follows"
+                sent.cause, sent.relation = cause, "follows"
                 return
         newest = past.newest
         if newest is not None and not kind.measured and _passes(newest, sent.node):
-            sent.cause, sent.how = newest, "holds"
+            sent.cause, sent.relation = newest, "holds"
 
     def _leads_anywhere(self, sent: SentEvent) -> bool:
         kind = self._kinds[sent.event]

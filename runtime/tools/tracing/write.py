@@ -155,8 +155,8 @@ class _Writer:
         run = self._moments.add(begin, run)
         yield from self._slice(LOOP, node, what, begin, end, run_s=run / 1e9)
 
-    def _event(self, *of: Any) -> Iterator[dict[str, Any]]:
-        note = EventNote(*of)
+    def _event(self, *fields: Any) -> Iterator[dict[str, Any]]:
+        note = EventNote(*fields)
         time, run = note.time, self._moments.add(note.time, note.run)
         sent = self._causes.add(note._replace(run=run))
         args: dict[str, Any] = {
@@ -212,12 +212,12 @@ class _Writer:
         yield from self._slice(THREADS, thread, name, begin, end, node=node, waited_ms=waited)
 
     def _worker(
-        self, process: str, method: str, asked: int, answered: int
+        self, process: str, method: str, requested: int, answered: int
     ) -> Iterator[dict[str, Any]]:
         # A process answers one call after the other: it begins when the last one is done.
-        begin = max(asked, self._answered.get(process, 0))
+        begin = max(requested, self._answered.get(process, 0))
         self._answered[process] = answered
-        waited = round((begin - asked) / 1e6, 6)
+        waited = round((begin - requested) / 1e6, 6)
         yield from self._slice(WORKERS, process, method, begin, answered, waited_ms=waited)
 
     def _us(self, time: int) -> float:
@@ -235,7 +235,7 @@ class _Moments:
         self._times: list[int] = []
 
     def add(self, time: int, run: int) -> int:
-        """Note the clock's `run` at real time `time`; return the true reading then."""
+        """Record the clock's `run` at real time `time`; return the true reading then."""
         if self._rate is not None:
             return self._rate.run(run)
         if not self._runs or run > self._runs[-1]:
@@ -257,12 +257,13 @@ def describe(path: list[SentEvent]) -> str:
     """Return a path as text: ``→`` where an event follows, ``⇢`` where this is a guess."""
     arrows = {"begins": "", "follows": " → ", "holds": " ⇢ "}
     return "".join(
-        f"{arrows[s.how]}{s.source if s.how == 'begins' else s.node} {s.event}" for s in path
+        f"{arrows[s.relation]}{s.source if s.relation == 'begins' else s.node} {s.event}"
+        for s in path
     )
 
 
-def _metadata(what: str, process: int, track: int, **args: Any) -> dict[str, Any]:
-    return {"ph": "M", "name": what, "pid": process, "tid": track, "args": args}
+def _metadata(kind: str, process: int, track: int, **args: Any) -> dict[str, Any]:
+    return {"ph": "M", "name": kind, "pid": process, "tid": track, "args": args}
 
 
 class TraceEvent(msgspec.Struct):
@@ -356,13 +357,13 @@ def node_loads(trace: Trace) -> list[NodeLoad]:
     own_times = _own_times(slices)
     total = max((e.ts + e.dur for e in slices), default=0.0) - (slices[0].ts if slices else 0.0)
     by_node: dict[str, list[tuple[float, str]]] = {}
-    for slice_, own in zip(slices, own_times, strict=True):
-        by_node.setdefault(names[slice_.tid], []).append((own, slice_.name))
+    for slice_, own_time in zip(slices, own_times, strict=True):
+        by_node.setdefault(names[slice_.tid], []).append((own_time, slice_.name))
     loads = []
     for node, steps in by_node.items():
-        busy, (longest, what) = sum(own for own, _ in steps), max(steps)
+        busy, (longest, step) = sum(own_time for own_time, _ in steps), max(steps)
         share = busy / total if total else 0.0
-        loads.append(NodeLoad(node, len(steps), busy / 1e3, share, longest / 1e3, what))
+        loads.append(NodeLoad(node, len(steps), busy / 1e3, share, longest / 1e3, step))
     return sorted(loads, key=lambda load: -load.busy_ms)
 
 
@@ -374,12 +375,12 @@ def quantile(values: list[float], q: float) -> float:
 
 def _own_times(slices: list[TraceEvent]) -> list[float]:
     """Return each slice's own time (µs), without nested slices; sorted by beginning."""
-    alone = [slice_.dur for slice_ in slices]
+    times = [slice_.dur for slice_ in slices]
     open_: list[int] = []
     for index, slice_ in enumerate(slices):
         while open_ and slices[open_[-1]].ts + slices[open_[-1]].dur <= slice_.ts:
             open_.pop()
         if open_:
-            alone[open_[-1]] -= slice_.dur
+            times[open_[-1]] -= slice_.dur
         open_.append(index)
-    return [max(own, 0.0) for own in alone]
+    return [max(duration, 0.0) for duration in times]

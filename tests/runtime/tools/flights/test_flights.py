@@ -25,11 +25,11 @@ from runtime.tools.flights import (
     fly,
     home,
     kept,
-    put,
+    read_object,
     recorded,
     remove_beyond,
     settings_key,
-    taken,
+    write_object,
 )
 from tests.runtime.tools.flights import samples
 from tests.runtime.tools.flights.samples import Seen, events_of, flown
@@ -255,9 +255,9 @@ def test_answers_come_back_with_their_very_types(
 ) -> None:
     sent = Seen(stamp=1, source="craft", number=number, data=data.T if transposed else data)
     file = io.BytesIO(b"")
-    put(file, sent)
-    place = put(file, sent)
-    again = taken(memoryview(file.getvalue()), place)
+    write_object(file, sent)
+    place = write_object(file, sent)
+    again = read_object(memoryview(file.getvalue()), place)
     assert type(again.number) is type(number)
     digests = [Digest(), Digest()]
     for digest, event in zip(digests, (sent, again), strict=True):

@@ -10,7 +10,7 @@ from events import TrackedFeatures
 from runtime.errors import VisnavError
 from runtime.run.supervisor import Supervisor
 from runtime.tools.monitor.observer import Observer
-from runtime.tools.monitor.server import IMAGE_PERIOD, MAX_SIDE, Kept, small_jpeg
+from runtime.tools.monitor.server import IMAGE_PERIOD, MAX_SIDE, ResultCache, small_jpeg
 from tests.runtime.tools.monitor.test_observer import observe
 
 CAMERA = "drone.images: drone/front"
@@ -68,7 +68,7 @@ def test_images_are_made_no_oftener_than_said(monkeypatch: pytest.MonkeyPatch) -
         made.append(name)
         return name.encode()
 
-    kept = Kept()
+    kept = ResultCache()
     assert {kept.get("a", IMAGE_PERIOD, lambda: make("a")) for _ in range(5)} == {b"a"}
     kept.get("b", IMAGE_PERIOD, lambda: make("b"))
     now += IMAGE_PERIOD

@@ -27,17 +27,17 @@ class Story:
         self.causes = Causes(KINDS, HEARERS)
         self.number = 0
 
-    def __call__(self, sender: str, event: str, stamp: int, given: int = 0) -> SentEvent:
+    def __call__(self, sender: str, event: str, stamp: int, cause_id: int = 0) -> SentEvent:
         self.number += 1
         source = sender.partition(".")[0]
         number = self.number
         return self.causes.add(
-            EventNote(number, number, sender, event, source, stamp, number, given)
+            EventNote(number, number, sender, event, source, stamp, number, cause_id)
         )
 
 
 def path(sent: SentEvent) -> list[tuple[str, str]]:
-    return [(step.event, step.how) for step in sent.path()]
+    return [(step.event, step.relation) for step in sent.path()]
 
 
 def test_an_estimate_follows_from_the_image_whose_stamp_it_bears() -> None:
@@ -62,7 +62,7 @@ def test_what_a_node_sends_on_hearing_an_event_follows_from_it() -> None:
     tell("drone.images", "Image", 10)
     pose = tell("vo.poses", "Pose", 10)
     tell("drone.images", "Image", 20)
-    sent = tell("pilot.setpoints", "Setpoint", 25, given=2)
+    sent = tell("pilot.setpoints", "Setpoint", 25, cause_id=2)
     assert sent.cause is pose
     assert path(sent) == [("Image", "begins"), ("Pose", "follows"), ("Setpoint", "follows")]
 
@@ -80,16 +80,16 @@ def test_no_path_goes_on_behind_a_set_point_or_through_a_node_twice() -> None:
     tell = Story()
     tell("drone.images", "Image", 10)
     tell("vo.poses", "Pose", 10)
-    tell("pilot.setpoints", "Setpoint", 12, given=2)
-    assert tell("drone.notes", "Note", 13, given=3).cause is None
-    assert tell("vo.poses", "Pose", 99, given=0).how == "holds"
+    tell("pilot.setpoints", "Setpoint", 12, cause_id=2)
+    assert tell("drone.notes", "Note", 13, cause_id=3).cause is None
+    assert tell("vo.poses", "Pose", 99, cause_id=0).relation == "holds"
 
 
 def test_a_sensor_begins_whatever_its_node_was_given() -> None:
     tell = Story()
     tell("drone.images", "Image", 10)
     tell("vo.poses", "Pose", 10)
-    assert path(tell("drone.images", "Image", 20, given=2)) == [("Image", "begins")]
+    assert path(tell("drone.images", "Image", 20, cause_id=2)) == [("Image", "begins")]
 
 
 def test_without_a_sensor_there_is_no_path() -> None:
@@ -100,6 +100,6 @@ def test_nothing_follows_from_what_its_node_does_not_hear() -> None:
     tell = Story()
     tell("drone.images", "Image", 10)
     tell("vo.poses", "Pose", 10)
-    tell("drone.notes", "Note", 12, given=2)
-    sent = tell("pilot.setpoints", "Setpoint", 13, given=3)  # which is vo's alone
+    tell("drone.notes", "Note", 12, cause_id=2)
+    sent = tell("pilot.setpoints", "Setpoint", 13, cause_id=3)  # which is vo's alone
     assert path(sent) == [("Image", "begins"), ("Pose", "follows"), ("Setpoint", "holds")]

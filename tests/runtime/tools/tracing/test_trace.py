@@ -165,7 +165,7 @@ def test_time_in_a_trace_begins_before_all_that_is_in_it(tmp_path: Path) -> None
     begin = notes.origin
     late = 123_456_789_000_000_000  # of an announcement that bears the time of day, say
     announced = ("event", begin + 5_000, 0, None, PoseEstimate, "a", late, 7_000_000, 0, None)
-    notes.put([announced, ("step", "a", "run", begin + 2_000, begin + 9_000, 0, 0)])
+    notes.add([announced, ("step", "a", "run", begin + 2_000, begin + 9_000, 0, 0)])
     notes.close()
     write.write_trace(notes, tmp_path / "t.json", name="x", clock="lockstep", nodes=["a"])
     assert [e.ts for e in read_trace(tmp_path / "t.json").events if e.ph == "X"] == [5.0, 2.0]
