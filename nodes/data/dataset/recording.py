@@ -251,7 +251,7 @@ def extra_fields(kind: Any) -> list[msgspec.structs.FieldInfo]:
 
 
 def extra_values(announcement: CameraAnnouncement | ImuAnnouncement) -> dict[str, str]:
-    """Return the `notable` fields that are not their defaults, as YAML."""
+    """Return the `extra_fields` that are not their defaults, as YAML."""
     fields = {}
     for field in extra_fields(announcement):
         value = getattr(announcement, field.name)

@@ -211,7 +211,7 @@ def open_for_writing(path: Path) -> IO[bytes]:
 
 
 def is_being_written(file: IO[bytes]) -> bool:
-    """Return whether a process holds a file from `open_anew`."""
+    """Return whether a process holds a file from `open_for_writing`."""
     return not _locked(file, fcntl.LOCK_SH)
 
 

@@ -65,7 +65,7 @@ class Landmarks:
         Args:
             number: Number of the key frame, not less than any before.
             pose: World to camera, shape (4, 4).
-            seen: Their surfaces, all continuous.
+            surfaces: Those of the landmarks, all continuous.
         """
         in_world, new = inverse(pose), np.zeros(len(pixels), _LANDMARK)
         fx, fy, *_ = intrinsics(self._matrix)
@@ -219,7 +219,7 @@ class Described:
     """A key frame's points for relocalization, described when a lost camera first asks for them.
 
     Args:
-        inverse_of: As of `inverse_depth`; released once described.
+        inverse_depths: As of `inverse_depth`; released once described.
         matrix: K, shape (3, 3).
         noise: Standard deviation of inverse depth, 1/m.
     """

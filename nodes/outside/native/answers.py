@@ -135,9 +135,9 @@ def read_pose(body: bytearray) -> LinkAnswer:
         if miss > TOLERANCE:
             raise LinkError(f"POSE.pose: expected a rotation within {TOLERANCE:g}, off by {miss:g}")
     at += MATRIX
-    given = np.split(np.frombuffer(body, "<f8", numbers, at), [36] if follows & COVARIANCE else [])
-    covariance = given[0].reshape(6, 6) if follows & COVARIANCE else None
-    velocity = given[-1] if follows & VELOCITY else None
+    arrays = np.split(np.frombuffer(body, "<f8", numbers, at), [36] if follows & COVARIANCE else [])
+    covariance = arrays[0].reshape(6, 6) if follows & COVARIANCE else None
+    velocity = arrays[-1] if follows & VELOCITY else None
     _finite("POSE.covariance", covariance)
     _finite("POSE.velocity", velocity)
     at += 8 * numbers

@@ -402,11 +402,11 @@ def read_header(data: bytes | bytearray, at: int = 0) -> tuple[int, int]:
 
 def _exactly(connection: socket.socket, size: int) -> bytearray:
     data = bytearray(size)
-    rest = memoryview(data)
-    while rest:
-        if not (count := connection.recv_into(rest, 0, socket.MSG_WAITALL)):
+    remaining = memoryview(data)
+    while remaining:
+        if not (count := connection.recv_into(remaining, 0, socket.MSG_WAITALL)):
             raise EOFError
-        rest = rest[count:]
+        remaining = remaining[count:]
     return data
 
 

@@ -87,16 +87,16 @@ class _Program:
         data = self.connection.recv(_AT_ONCE, socket.MSG_DONTWAIT)
         if not data:
             raise EOFError
-        received, begin = self._received, 0
+        received, start = self._received, 0
         received += data
-        while len(received) >= begin + wire.HEADER.size:
-            length, kind = wire.read_header(received, begin)
-            body = begin + wire.HEADER.size
+        while len(received) >= start + wire.HEADER.size:
+            length, kind = wire.read_header(received, start)
+            body = start + wire.HEADER.size
             if len(received) < body + length:
                 break
-            begin = body + length
-            yield kind, received[body:begin]
-        del received[:begin]
+            start = body + length
+            yield kind, received[body:start]
+        del received[:start]
 
     def send(self, kind: int, *parts: bytes) -> bool:
         """Send a message, or return False: the program is gone."""
@@ -322,24 +322,24 @@ class Endpoint:
         except OSError:
             self._drop(program, "its connection has ended")
 
-    def _drop(self, program: _Program, why: str, wrong: bool = False) -> None:
+    def _drop(self, program: _Program, reason: str, wrong: bool = False) -> None:
         """End a connection; `wrong` if the program broke the protocol."""
         with self._changed:
             program.gone = True
             if self._program is program:
                 self._program = None
             if program.name and not program.poses and self._program is None:
-                self._problem = f"found {program.name}: {why}"
+                self._problem = f"found {program.name}: {reason}"
             closed = self._closed
             self._changed.notify_all()
         refused = wrong and not program.poses
         head = (wire.REFUSED, GREETING) if refused else (wire.BYE,)
         self._selector.unregister(program.connection)
-        program.end(*head, why.encode())
+        program.end(*head, reason.encode())
         program.connection.close()
         self._programs.remove(program)
         if program.poses and not closed:
-            self._gone(f"{program.name}: {why}")
+            self._gone(f"{program.name}: {reason}")
 
     def _greet(self, program: _Program, kind: int, body: bytearray) -> None:
         """Accept the program that says HELLO if there is no other, and send WELCOME."""

@@ -154,44 +154,44 @@ class Launch:
         # Where it has to connect: in its folder, if the path is not too long for one.
         self.socket = self.folder / "link.socket"
         if bridge is None:
-            self._of_ros = {}
+            self._ros_environment = {}
         else:
             router = [*(bridge.listen or bridge.connect or ["tcp/localhost:7447"])]
-            self._of_ros = {
+            self._ros_environment = {
                 "ROS_DOMAIN_ID": str(bridge.domain_id),
                 "RMW_IMPLEMENTATION": "rmw_zenoh_cpp",
                 "ZENOH_CONFIG_OVERRIDE": f"connect/endpoints={json.dumps(router)}",
             }
 
-    def missing(self, what: str, command: Sequence[str]) -> str:
+    def missing(self, setting: str, command: Sequence[str]) -> str:
         """Return an error if a command cannot be started; empty otherwise."""
         if not self.working.is_dir():
             return f"folder: expected a folder, found none at {self.working}"
-        word = self._expanded(command[0])
-        place = str(self.working / word) if "/" in word else word
+        program = self._expanded(command[0])
+        place = str(self.working / program) if "/" in program else program
         if shutil.which(place, path=self.environment().get("PATH")) is not None:
             return ""
-        return f"{what}: expected a program that can be executed, found none at {place}"
+        return f"{setting}: expected a program that can be executed, found none at {place}"
 
     def take_processors(
         self,
-        taken: list[int],  # those chosen by others; this program's are added
+        used: list[int],  # those chosen by others; this program's are added
     ) -> str:
         """Choose the processors, the least used first; return an error if there are too few."""
         processors, count = sorted(os.sched_getaffinity(0), reverse=True), self._config.cpus
         if count > len(processors):
             return f"cpus: expected at most the {len(processors)} there are, found {count}"
-        self._processors = sorted(processors, key=taken.count)[:count]
-        taken += self._processors
+        self._processors = sorted(processors, key=used.count)[:count]
+        used += self._processors
         return ""
 
-    def make_folder(self, *, anew: bool) -> None:
-        """Create the program's folder; `anew` removes old content, lest the program read any."""
+    def make_folder(self, *, fresh: bool) -> None:
+        """Create the program's folder; `fresh` removes old content."""
         if self._folder is None or len(os.fsencode(self.socket)) > _LONGEST:
             self._temporary = Path(tempfile.mkdtemp(prefix="visnav-"))
             self.socket = self._temporary / "link.socket"
         self.folder = self._folder or self.socket.parent
-        if anew and self._temporary is None and self.folder.is_dir():
+        if fresh and self._temporary is None and self.folder.is_dir():
             shutil.rmtree(self.folder)
         self.folder.mkdir(parents=True, exist_ok=True)
 
@@ -226,11 +226,11 @@ class Launch:
             "VISNAV_PYTHON": sys.executable,
         }
         settings = {name: str(value) for name, value in self._config.environment.items()}
-        return {**os.environ, **places, **self._of_ros, **settings}
+        return {**os.environ, **places, **self._ros_environment, **settings}
 
     def _expanded(self, word: str) -> str:
-        known = self.environment()
-        return re.sub(r"\$(?:(\w+)|{(\w+)})", lambda m: known.get(m[1] or m[2], m[0]), word)
+        environment = self.environment()
+        return re.sub(r"\$(?:(\w+)|{(\w+)})", lambda m: environment.get(m[1] or m[2], m[0]), word)
 
     def remarks(self, rig: Rig | None) -> list[str]:
         """Return what the calibration's files do not say, or say otherwise, a sentence each."""
@@ -240,11 +240,11 @@ class Launch:
         fitted = with_kannala_brandt(rig)[1] if form == _KB4 else []
         return [*left_out(rig, "basalt" if form == _KB4 else form), *fitted]
 
-    def texts(self, known: Mapping[str, Any], rig: Rig | None) -> dict[Path, str]:
+    def texts(self, variables: Mapping[str, Any], rig: Rig | None) -> dict[Path, str]:
         """Return the texts of the program's files, by path.
 
         Args:
-            known: Variables of the templates, by name.
+            variables: Variables of the templates, by name.
             rig: Sensors of the calibration; `None` if there are no cameras.
 
         Raises:
@@ -266,12 +266,12 @@ class Launch:
             template = Path(file.template)
             try:
                 ready = templates(template.parent).get_template(template.name)
-                texts[self.folder / file.path] = ready.render(known)
+                texts[self.folder / file.path] = ready.render(variables)
             except jinja2.TemplateNotFound as error:
                 missing = template.parent / str(error.name)
                 raise ProgramError(f"files: {missing}: expected a template, found none") from None
             except (jinja2.TemplateError, ValueError, TypeError, ArithmeticError) as error:
                 line = getattr(error, "lineno", None)
-                where = f"{template}: line {line}" if line else str(template)
-                raise ProgramError(f"files: {where}: {error}") from None
+                place = f"{template}: line {line}" if line else str(template)
+                raise ProgramError(f"files: {place}: {error}") from None
         return texts

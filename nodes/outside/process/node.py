@@ -105,15 +105,15 @@ class Process(Estimator[ProcessConfig]):
         self._named: dict[str, CameraAnnouncement] = {}
         self._imus: list[ImuAnnouncement] = []
         self._inputs = Inputs((*dict.fromkeys((*config.reads, *filter(None, [config.asks]))),))
-        self._asked = -1
-        self._further: dict[int, Mount] = {}
+        self._trigger_count = -1
+        self._output_mounts: dict[int, Mount] = {}
         self._slots: dict[tuple[str, type], Slot] = {}
         self._feed: Feed | None = None
         self._program: Program | None = None
         self._connected = self._closing = False
         self._pose: npt.NDArray[np.float64] = np.eye(4)
         self._unsent = 0
-        self._why_gone = ""
+        self._disconnect_reason = ""
         configs = (node.config for node in self.siblings(Node))
         publishers = (config for config in configs if isinstance(config, PublishingConfig))
         self._bridge = next((config for config in publishers if hasattr(config, "domain_id")), None)
@@ -127,7 +127,7 @@ class Process(Estimator[ProcessConfig]):
         """Create the program's folder, and run the build command."""
         if self.checking:
             return
-        await self.offload(self._launch.make_folder, anew=not self.restarts)
+        await self.offload(self._launch.make_folder, fresh=not self.restarts)
         try:
             await self._build()
         except BaseException:
@@ -144,7 +144,7 @@ class Process(Estimator[ProcessConfig]):
         try:
             await self.offload(build.wait)
         finally:  # of a run that is to end, too
-            build.leave()
+            build.request_end()
             show.end()
         if build.code != 0:
             raise ProgramError(f"build: {' '.join(command)} {build.story()}")
@@ -185,7 +185,7 @@ class Process(Estimator[ProcessConfig]):
                 return
         super().on_announcement(announcement)
         if names:
-            self.sources.pop("frames", None)  # those of the others are wanted, too
+            self.sources.pop("frames", None)  # images of all these cameras are read
 
     def check(self) -> Iterable[str]:
         """Yield an error for each missing camera, bridge, program or template."""
@@ -197,9 +197,9 @@ class Process(Estimator[ProcessConfig]):
                 yield from super().check()
             yield from self._choose_inputs()
             for name in config.cameras:
-                given = {*self._named[name].images} if name in self._named else set()
-                if lacking := self.needs - given - ({"grey"} if "rgb" in given else set()):
-                    kinds = ", ".join(sorted(lacking))
+                images = {*self._named[name].images} if name in self._named else set()
+                if missing_kinds := self.needs - images - ({"grey"} if "rgb" in images else set()):
+                    kinds = ", ".join(sorted(missing_kinds))
                     yield f"cameras: expected {kinds} images of {name}, found none"
             frames = config.latency * self.camera.rate if self.camera else 2.0
             if config.hold.skips == "allowed" and frames <= 1.0 and self.clock.kind == "lockstep":
@@ -207,12 +207,12 @@ class Process(Estimator[ProcessConfig]):
                     'hold.skips: expected a latency above the camera\'s period with "allowed": no '
                     "later frame goes out while time waits for this one"
                 )
-        what = "build" if self.checking and config.build else "command"  # built later
-        if words := getattr(config, what):
-            yield from filter(None, [self._launch.missing(what, words)])
+        setting = "build" if self.checking and config.build else "command"  # built later
+        if command := getattr(config, setting):
+            yield from filter(None, [self._launch.missing(setting, command)])
         yield from filter(None, [self._launch.take_processors(self.share("cpus", list[int]))])
         try:
-            self._launch.texts(self._known(), self._rig())
+            self._launch.texts(self._template_variables(), self._rig())
         except ProgramError as error:
             yield str(error)
 
@@ -224,7 +224,7 @@ class Process(Estimator[ProcessConfig]):
         rig = self._rig()
         for remark in launch.remarks(rig):
             self.log.warning("calibration: %s", remark)
-        for path, text in launch.texts(self._known(), rig).items():
+        for path, text in launch.texts(self._template_variables(), rig).items():
             path.parent.mkdir(parents=True, exist_ok=True)
             await self.offload(path.write_text, text, "utf-8")
         if config.feed == "link":
@@ -255,7 +255,7 @@ class Process(Estimator[ProcessConfig]):
             self.narrow("imu", imus[0])
         cameras = rig.cameras if rig else ()
         kinds = [KINDS[kind][0] for kind in config.images]
-        self._wanted = [(number, kind) for number, _ in enumerate(cameras) for kind in kinds]
+        self._image_keys = [(number, kind) for number, _ in enumerate(cameras) for kind in kinds]
         if cameras:
             sources = [_source(camera, kind) for camera in cameras for kind in config.images]
             fields = {f"image{n}": Field(event, "one") for n, (_, event) in enumerate(sources)}
@@ -265,7 +265,7 @@ class Process(Estimator[ProcessConfig]):
         self._hold: Hold[LinkAnswer] = self.hold(self.name, config.hold, config.latency)
         real = self.clock.kind == "real"
         slots = math.ceil(config.latency * cameras[0].rate) + 2 if cameras else _SLOTS
-        goes_on = config.hold.on_missing == "continue"
+        continues = config.hold.on_missing == "continue"
         pixels = sum(camera.info.height * camera.info.width for camera in cameras)
         described = [(c, kinds) for c in cameras], self._inputs.chosen, {"kind": self.clock.kind}
         return Feed(
@@ -274,7 +274,7 @@ class Process(Estimator[ProcessConfig]):
             self._hold,
             self._processes,
             waits=not real,
-            room=slots if real else _BEYOND if goes_on else math.inf,
+            room=slots if real else _BEYOND if continues else math.inf,
             slots=slots,
             slot_bytes=pixels * sum(KINDS[kind][1] for kind in config.images),
             gone=self._disconnected,
@@ -296,28 +296,33 @@ class Process(Estimator[ProcessConfig]):
 
     @on(*(k.event for k in sensor_kinds() if k.event is not Imu), PoseEstimate, TrackingLost)
     def measurements(self, event: Event) -> None:
-        """Store an input until the next frame; ask for an answer, if it is the one that asks."""
+        """Store an input until the next frame; the input `asks` sends a frame itself."""
         name = self._inputs.store(event, self.clock.now())
         if not name or name != self.config.asks or self._feed is None:
             return
-        self._asked += 1
-        if self._asked % self.config.every == 0 and self.exposed_at(event) > self._hold.newest:
-            self._ask(event, self.exposed_at(event), ())
+        self._trigger_count += 1
+        if (
+            self._trigger_count % self.config.every == 0
+            and self.exposed_at(event) > self._hold.newest
+        ):
+            self._send_frame(event, self.exposed_at(event), ())
 
     @on(Image, DepthImage)
     def frames(self, event: Image | DepthImage) -> None:
-        """Put the images of an exposure together; once all are there, they are sent."""
+        """Collect the images of an exposure, which are sent when complete."""
         slot = self._slots.get((event.source, type(event)))
         if slot is not None:
             slot.add(event)
 
     def _send(self, images: tuple[Image | DepthImage, ...]) -> None:
         """Send an exposure."""
-        exposure = [(*wanted, image) for wanted, image in zip(self._wanted, images, strict=True)]
-        self._ask(images[0], images[0].stamp, exposure)
+        exposure = [
+            (*image_key, image) for image_key, image in zip(self._image_keys, images, strict=True)
+        ]
+        self._send_frame(images[0], images[0].stamp, exposure)
 
-    def _ask(self, event: Event, stamp: int, exposure: Exposure) -> None:
-        """Send a frame, with what came since the last, and await the answer."""
+    def _send_frame(self, event: Event, stamp: int, exposure: Exposure) -> None:
+        """Send a frame, with the inputs since the last one, and await the answer."""
         assert self._feed is not None
         owed = self._hold.owe(stamp)
         if not self._hold.expects or self._feed.full:
@@ -349,29 +354,29 @@ class Process(Estimator[ProcessConfig]):
     ) -> None:
         """Publish the pose of another output, in a frame that begins with its first."""
         stamp, number = self.exposed_at(event), answer.output
-        mount = self._further.setdefault(number, self._mounting(stamp))
+        mount = self._output_mounts.setdefault(number, self._mounting(stamp))
         result = TrackingResult(pose, velocity=answer.velocity, covariance=answer.covariance)
         source = f"{self.name}/{self.config.outputs[number - 1]}"
         self.estimates.send(mount.estimate(stamp, source, result))
 
     def _order(self, order: LinkOrder) -> None:
         """Pass an order on to the vehicle."""
-        who: Any = {
+        header: Any = {
             "stamp": self.clock.now(),
             "source": self.name,
             "vehicle": self.config.vehicle,
         }
         velocity, yaw_rate = order.velocity, order.yaw_rate
         if order.order == "takeoff":
-            self.commands.send(Takeoff(**who, altitude=-order.position[2]))
+            self.commands.send(Takeoff(**header, altitude=-order.position[2]))
         elif order.order == "land":
-            self.commands.send(Land(**who))
+            self.commands.send(Land(**header))
         elif order.order == "position":
             place: Any = {"position": order.position, "velocity": velocity, "yaw": order.yaw}
-            self.setpoints.send(PositionSetpoint(**who, **place, yaw_rate=yaw_rate))
+            self.setpoints.send(PositionSetpoint(**header, **place, yaw_rate=yaw_rate))
         else:
-            way: Any = {"frame_id": order.axes, "velocity": velocity, "yaw_rate": yaw_rate}
-            self.setpoints.send(VelocitySetpoint(**who, **way))
+            fields: Any = {"frame_id": order.axes, "velocity": velocity, "yaw_rate": yaw_rate}
+            self.setpoints.send(VelocitySetpoint(**header, **fields))
 
     # After the run.
 
@@ -401,38 +406,38 @@ class Process(Estimator[ProcessConfig]):
     def _processes(self) -> list[int]:
         return [] if self._program is None else self._program.processes()
 
-    def _disconnected(self, why: str) -> None:
+    def _disconnected(self, reason: str) -> None:
         """Report the end of the program's connection."""
-        self._why_gone = why
-        self._hold.gone(self._story(why))
+        self._disconnect_reason = reason
+        self._hold.gone(self._story(reason))
 
     def _on_end(self, story: str) -> None:
         """Report the program's end before the run's."""
-        if self._closing:  # as was asked for
+        if self._closing:  # as requested
             return
         story = f"{self.config.command[0]} {story}"
         if self._feed is not None:
-            self._hold.gone("; ".join(filter(None, [self._why_gone, story])))
+            self._hold.gone("; ".join(filter(None, [self._disconnect_reason, story])))
             if not self._connected:
                 self._feed.close()
-        elif self._ends_the_run():
+        elif self._is_required():
             with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._loop.call_soon_threadsafe(self._end.set_result, story)
         else:
             self.log.warning("%s", story)
 
-    def _ends_the_run(self) -> bool:
+    def _is_required(self) -> bool:
         """Return whether the bridge depends on the program's answers."""
         subscriptions = getattr(self._bridge, "subscriptions", ())
         held = [topic.hold for topic in subscriptions if topic.answers_to]
         return not held or any(hold.on_missing == "error" for hold in held)
 
-    def _story(self, why: str) -> str:
+    def _story(self, reason: str) -> str:
         """Return the reason of a missing connection, with the program's end and last output."""
         if self._program is None:
-            return why
+            return reason
         self._program.wait(_STORY)
-        return f"{why}; {self.config.command[0]} {self._program.story()}"
+        return f"{reason}; {self.config.command[0]} {self._program.story()}"
 
     # What was announced.
 
@@ -447,11 +452,11 @@ class Process(Estimator[ProcessConfig]):
         if self.config.images:
             return super()._sensor()
         asks = self.config.asks
-        of = next(announced for name, _, announced in self._inputs.chosen if name == asks)
-        body = of.source.rpartition("/")[0] or self.config.vehicle
+        trigger = next(announced for name, _, announced in self._inputs.chosen if name == asks)
+        body = trigger.source.rpartition("/")[0] or self.config.vehicle
         body = body or next((vehicle.source for vehicle in self._vehicles), self.name)
-        frame = getattr(of, "parent_frame_id", "base_link")
-        rate = getattr(of, "rate", 0.0)
+        frame = getattr(trigger, "parent_frame_id", "base_link")
+        rate = getattr(trigger, "rate", 0.0)
         return SensorAnnouncement(stamp=0, source=f"{body}/", rate=rate, parent_frame_id=frame)
 
     def _rig(self) -> Rig | None:
@@ -461,12 +466,12 @@ class Process(Estimator[ProcessConfig]):
         if self.camera is None or len(cameras) < len(names):
             return None
         body = self.camera.source.rpartition("/")[0]
-        wanted = self.sources.get("imu")
-        imus = (imu for imu in self._imus if imu.source == wanted or wanted is None)
-        imu = next((imu for imu in imus if wanted or imu.source.rpartition("/")[0] == body), None)
+        imu_name = self.sources.get("imu")
+        imus = (imu for imu in self._imus if imu.source == imu_name or imu_name is None)
+        imu = next((imu for imu in imus if imu_name or imu.source.rpartition("/")[0] == body), None)
         return Rig(body, tuple(cameras) or (self.camera,), imu)
 
-    def _known(self) -> dict[str, Any]:
+    def _template_variables(self) -> dict[str, Any]:
         """Return the variables of the templates."""
 
         def topic(kind: TopicKind, source: str) -> str:
@@ -475,7 +480,7 @@ class Process(Estimator[ProcessConfig]):
 
         rig = self._rig()
         vehicles = (vehicle for vehicle in self._vehicles if rig and vehicle.source == rig.body)
-        of_the_run = {
+        run_variables = {
             "vehicle": next(vehicles, None),
             "topic": topic,
             "folder": str(self._launch.folder),
@@ -486,12 +491,12 @@ class Process(Estimator[ProcessConfig]):
             "imu": None,
             "stereo": False,
             **(variables(rig, topics=self.config.feed == "ros2") if rig else {}),
-            **of_the_run,
+            **run_variables,
         }
 
 
 def _source(camera: CameraAnnouncement, kind: str) -> tuple[str, type[Image | DepthImage]]:
     """Return source and type of a camera's images of a kind."""
-    both = kind == "grey" and {"rgb", "grey"} <= {*camera.images}
-    source = f"{camera.source}/grey" if both else camera.source
+    separate_grey = kind == "grey" and {"rgb", "grey"} <= {*camera.images}
+    source = f"{camera.source}/grey" if separate_grey else camera.source
     return source, DepthImage if kind == "depth" else Image

@@ -86,20 +86,20 @@ class Program:
         self._output = Output(printed)
         self._closing = False
         self._over = threading.Event()
-        self._how = ""
-        self._control, theirs = socket.socketpair()
+        self._ending = ""
+        self._control, guard_end = socket.socketpair()
         guard = [sys.executable, "-I", "-S", str(Path(__file__).with_name("guard.py"))]
         numbers = ",".join(map(str, processors))
         self._terminal, prints = _terminal()
-        with theirs, os.fdopen(prints, "wb", buffering=0) as stdout:
+        with guard_end, os.fdopen(prints, "wb", buffering=0) as stdout:
             self._guard = subprocess.Popen(  # noqa: S603  # what the user's file says
-                [*guard, str(theirs.fileno()), str(grace), numbers, *command],
+                [*guard, str(guard_end.fileno()), str(grace), numbers, *command],
                 cwd=folder,
                 env=environment,
                 stdin=subprocess.DEVNULL,
                 stdout=stdout,
                 stderr=subprocess.STDOUT,
-                pass_fds=(theirs.fileno(),),
+                pass_fds=(guard_end.fileno(),),
                 process_group=0,  # so that a terminal's Ctrl-C does not reach it
             )
         self._watcher = threading.Thread(target=self._watch, name=command[0], daemon=True)
@@ -120,33 +120,33 @@ class Program:
 
     def story(self) -> str:
         """Return how the program ended, or "still runs", and its last output."""
-        return self._output.story(self._how or "still runs")
+        return self._output.story(self._ending or "still runs")
 
-    def leave(self) -> None:
-        """Ask the guard to end the program; return at once."""
+    def request_end(self) -> None:
+        """Request the program's end from the guard; return at once."""
         self._closing = True
         with contextlib.suppress(OSError):
             self._control.shutdown(socket.SHUT_WR)
 
     def close(self) -> None:
         """End the program and all its processes. Takes up to its grace: not on a loop."""
-        self.leave()
+        self.request_end()
         self._watcher.join(self._grace + _LATE)
-        if self._watcher.is_alive():  # somebody stopped the guard
+        if self._watcher.is_alive():  # the guard is stopped
             self._guard.kill()
             self._watcher.join()
 
     def _watch(self) -> None:
         """Read the output and the exit code, until the guard has gone."""
         output, control = self._terminal, self._control.fileno()
-        news = select.poll()
-        news.register(output, select.POLLIN)
-        news.register(control, select.POLLIN)
+        poll = select.poll()
+        poll.register(output, select.POLLIN)
+        poll.register(control, select.POLLIN)
         exit_code, more = b"", b"\0"
         while more:
-            ready = {number for number, _ in news.poll()}
+            ready = {number for number, _ in poll.poll()}
             if output in ready and not self._read(output):
-                news.unregister(output)
+                poll.unregister(output)
             if control in ready:
                 more = self._control.recv(_AT_ONCE)
                 exit_code += more
@@ -159,20 +159,20 @@ class Program:
 
     def _read(self, output: int) -> bool:
         data = b""
-        with contextlib.suppress(OSError):  # a terminal that nobody writes to any more
+        with contextlib.suppress(OSError):  # a terminal whose writers are all closed
             data = os.read(output, _AT_ONCE)
         self._output.add(data)
         return bool(data)
 
     def _report_end(self, output: int, exit_code: str) -> None:
         """Report the program's end, after its last output is read."""
-        rest, until = select.poll(), time.monotonic() + _REST
-        rest.register(output, select.POLLIN)
-        while rest.poll(0) and time.monotonic() < until and self._read(output):
+        poll, deadline = select.poll(), time.monotonic() + _REST
+        poll.register(output, select.POLLIN)
+        while poll.poll(0) and time.monotonic() < deadline and self._read(output):
             pass
         with contextlib.suppress(ValueError):
             self.code = int(exit_code)
-        self._how = (exit_code or "killed") if self.code is None else how_it_ended(self.code)
+        self._ending = (exit_code or "killed") if self.code is None else how_it_ended(self.code)
         self._over.set()
         if not self._closing:
             self._ended(self.story())
@@ -184,11 +184,11 @@ def _terminal() -> tuple[int, int]:
     What is written to it arrives as it is, and is not echoed.
     """
     try:
-        ours, theirs = os.openpty()
+        read_end, write_end = os.openpty()
     except OSError:
         return os.pipe()
-    tty.setraw(theirs)
-    return ours, theirs
+    tty.setraw(write_end)
+    return read_end, write_end
 
 
 KINDS = {"rgb": ("rgb8", 3), "grey": ("mono8", 1), "depth": ("depth32f", 4)}
@@ -235,23 +235,23 @@ class Feed:
 
     @property
     def full(self) -> bool:
-        """Whether there is no room for a frame."""
+        """Return whether there is no room for a frame."""
         return self._outbox.qsize() >= self._room
 
     def send(self, stamp: int, exposure: Exposure, inputs: Sequence[Message]) -> None:
-        """Have inputs sent, and then a frame of a stamp (ns); returns at once."""
+        """Queue inputs, and then a frame of a stamp (ns), for sending."""
         self._outbox.put((stamp, exposure, inputs))
 
     def close(self) -> None:
-        """Say goodbye to the program; takes two seconds at most."""
+        """Close the connection to the program; takes two seconds at most."""
         self._closed = True
         self._outbox.put(None)
         self._endpoint.close()
         self._sender.join(1.0)
 
     def _send_all(self) -> None:
-        while (due := self._outbox.get()) is not None and not self._closed:
-            stamp, exposure, inputs = due
+        while (item := self._outbox.get()) is not None and not self._closed:
+            stamp, exposure, inputs = item
             images = [(camera, kind, _pixels(kind, event)) for camera, kind, event in exposure]
             try:
                 for message in inputs:
@@ -274,8 +274,8 @@ class Feed:
         self._initialised = self._initialised or answer.pose is not None
         useful = answer.pose is not None or bool(answer.before)
         useful = useful or (answer.status == "lost" and self._initialised)
-        says = answer.status if answer.status in ("initialising", "lost") else ""
-        self._hold.answer(answer.stamp, answer if useful else None, says)
+        status = answer.status if answer.status in ("initialising", "lost") else ""
+        self._hold.answer(answer.stamp, answer if useful else None, status)
 
 
 def _pixels(kind: str, event: Image | DepthImage) -> npt.NDArray[Any]:
@@ -331,10 +331,10 @@ class Inputs:
             sensor = self._find(name, body)
             if sensor is None:
                 sources = [announced.source for announced in self._announced]
-                known = f"found {', '.join(sources) or 'none'}{suggest(name, sources)}"
-                yield f"reads: expected a sensor or an estimator called {name}, {known}"
-            elif other := next((n for n, _, chosen in self.chosen if chosen is sensor), ""):
-                yield f"reads: expected each once, found {sensor.source} as {other} and as {name}"
+                listing = f"found {', '.join(sources) or 'none'}{suggest(name, sources)}"
+                yield f"reads: expected a sensor or an estimator called {name}, {listing}"
+            elif first := next((n for n, _, chosen in self.chosen if chosen is sensor), ""):
+                yield f"reads: expected each once, found {sensor.source} as {first} and as {name}"
             else:
                 self.chosen.append((name, _kind(sensor), sensor))
                 body = body or sensor.source.rpartition("/")[0]
@@ -369,12 +369,12 @@ class Inputs:
     def drain(self) -> list[Message]:
         """Return what has come since, in the order of arrival; rows of an input in one message."""
         rows_of_inputs = []
-        for number, together in itertools.groupby(self._waiting, lambda message: message.number):
-            messages = [*together]
+        for number, group in itertools.groupby(self._waiting, lambda message: message.number):
+            messages = [*group]
             scans = self.chosen[number][1] == "lidar_scan"
-            for some in [[message] for message in messages] if scans else [messages]:
-                rows = np.concatenate([message.rows for message in some])
-                rows_of_inputs.append(Message(number, some[-1].arrived, rows))
+            for part in [[message] for message in messages] if scans else [messages]:
+                rows = np.concatenate([message.rows for message in part])
+                rows_of_inputs.append(Message(number, part[-1].arrived, rows))
         self._waiting.clear()
         self._bytes = 0
         return rows_of_inputs

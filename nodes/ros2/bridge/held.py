@@ -39,7 +39,7 @@ _LOOK = 0.01  # real seconds between two polls of the subscriptions
 class HeldEstimator:
     """An estimator in ROS 2: presence, images owed an answer, answers (estimates and ``done``).
 
-    When nobody publishes any more, its hold is told after `patience` real seconds.
+    When its last publisher disappears, the hold is informed after `patience` real seconds.
     """
 
     def __init__(
@@ -60,37 +60,37 @@ class HeldEstimator:
         publications = [publication(kind, self.subscription.answers_to, config) for kind in images]
         self._images = [row.name for row in publications if row is not None]
         self._sequences: dict[bytes, int] = {}  # by GID
-        self._there: dict[str, None] = {}  # tokens of its publishers
-        self._came = self._gone = False
+        self._tokens: dict[str, None] = {}  # tokens of its publishers
+        self._was_complete = self._is_gone = False
         self._answerers: set[bytes] = set()  # GIDs
 
     def follow(self, session: Session) -> None:
         """Subscribe to the answers, and watch the estimator's publishers; may block."""
-        takes = [(t.topic, functools.partial(self._take, t)) for t in self._topics]
-        session.subscribe_in_order(takes)
+        callbacks = [(t.topic, functools.partial(self._receive, t)) for t in self._topics]
+        session.subscribe_in_order(callbacks)
         session.watch(self._topics[0].topic.name, "MP", self._changed)
 
     def missing(self, matched: Sequence[str]) -> str:
         """Return the missing publisher or subscriptions in words, given the matched topics."""
-        parts = [] if self._there else [f"a publisher of {self._topics[0].topic.name}"]
-        if lacking := [name for name in self._needs if name not in matched]:
-            parts.append(f"a subscription to {' and '.join(lacking)}")
+        parts = [] if self._tokens else [f"a publisher of {self._topics[0].topic.name}"]
+        if unmatched := [name for name in self._needs if name not in matched]:
+            parts.append(f"a subscription to {' and '.join(unmatched)}")
         elif not self._needs and not any(name in matched for name in self._images):
             parts.append(f"a subscription to {' or '.join(self._images)}")
-        self._came = self._came or not parts
+        self._was_complete = self._was_complete or not parts
         return " and ".join(parts)
 
     def owe(self, image: Event, matched: Callable[[], Sequence[str]]) -> Owed[Event] | None:
         """Return the answer owed to an image about to go out, the exposure's first, or `None`."""
         if image.source != self.subscription.answers_to or image.stamp <= self.hold.newest:
             return None
-        if self._gone and not self.missing(matched()):
-            self._gone = False
+        if self._is_gone and not self.missing(matched()):
+            self._is_gone = False
             self._answerers.clear()
             self.hold.back()
         return self.hold.owe(image.stamp)
 
-    def _take(self, incoming: IncomingTopic, message: Message) -> None:
+    def _receive(self, incoming: IncomingTopic, message: Message) -> None:
         try:
             if not self._is_next(incoming, message):
                 return
@@ -99,7 +99,7 @@ class HeldEstimator:
                 incoming.complain("message too large", expected)
             elif (answer := incoming.answer(message.read(), self._stamps)) is not None:
                 self.hold.answer(*answer)
-        except Exception as error:  # nobody looks at this thread
+        except Exception as error:  # reported by the hold, as this thread has no caller
             self.hold.fail(error)
 
     def _is_next(self, incoming: IncomingTopic, message: Message) -> bool:
@@ -123,21 +123,21 @@ class HeldEstimator:
             )
         return True
 
-    def _changed(self, there: bool, token: Token) -> None:
-        """Record the coming or going of a publisher of estimates; called in any thread."""
-        if there:
-            self._there[token.key] = None
+    def _changed(self, present: bool, token: Token) -> None:
+        """Record the presence or absence of a publisher of estimates; called in any thread."""
+        if present:
+            self._tokens[token.key] = None
             return
-        self._there.pop(token.key, None)
-        if self._came and not self._there:
-            late = threading.Timer(self._patience, self._miss)
+        self._tokens.pop(token.key, None)
+        if self._was_complete and not self._tokens:
+            late = threading.Timer(self._patience, self._report_missing)
             late.daemon = True
             late.start()
 
-    def _miss(self) -> None:
-        if not self._there:
+    def _report_missing(self) -> None:
+        if not self._tokens:
             self.hold.gone(f"nobody publishes {self._topics[0].topic.name} any more")
-            self._gone = True  # not before: `owe` reports it as back
+            self._is_gone = True  # not before: `owe` reports it as back
 
 
 def held_estimators(
@@ -147,13 +147,15 @@ def held_estimators(
     estimators = []
     started = any(getattr(sibling.config, "feed", "") == "ros2" for sibling in node.siblings(Node))
     for topic in incoming:
-        given = topic.subscription
-        if given.use == "estimate" and given.answers_to:
-            others = [other for other in incoming if given.is_told_by(other.subscription)]
-            hold = node.hold(topic.source, given.hold, given.latency)
+        subscription = topic.subscription
+        if subscription.use == "estimate" and subscription.answers_to:
+            done_topics = [
+                other for other in incoming if subscription.is_completed_by(other.subscription)
+            ]
+            hold = node.hold(topic.source, subscription.hold, subscription.latency)
             patience = STORY if started else 0.0
             estimators.append(
-                HeldEstimator([topic, *others], hold, stamps(), node.config, patience)
+                HeldEstimator([topic, *done_topics], hold, stamps(), node.config, patience)
             )
     return estimators
 
@@ -179,44 +181,44 @@ class HeldLine:
         self._early: list[Callable[[], object]] | None = []
         self._waiting: queue.SimpleQueue[tuple[Callable[..., object], object] | None]
         self._waiting = queue.SimpleQueue()
-        self._there: concurrent.futures.Future[str] = concurrent.futures.Future()
-        self._there.set_running_or_notify_cancel()  # a run that ends meanwhile does not cancel it
+        self._ready: concurrent.futures.Future[str] = concurrent.futures.Future()
+        self._ready.set_running_or_notify_cancel()  # a run that ends meanwhile does not cancel it
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, name="publishes", daemon=True)
 
     def publisher(self, topic: Topic) -> Publisher:
         """Declare a topic."""
-        made = self._session.publisher(topic, held=True)
-        made.note = self._note
-        self._publishers.append(made)
-        return made
+        declared = self._session.publisher(topic, held=True)
+        declared.on_put = self._record_sent
+        self._publishers.append(declared)
+        return declared
 
     async def begin(self, first: Callable[[], object]) -> None:
-        """Wait for the estimators, while time stands, and begin to publish.
+        """Wait for the estimators, while time stands, and start publishing.
 
         Args:
-            first: Puts the messages that hold for the whole run.
+            first: Publishes the messages that are valid for the whole run.
 
         Raises:
-            FatalError: They are not there in time.
+            FatalError: They do not appear in time.
         """
         self._thread.start()
-        if missing := await self._node.clock.beside(self._there):
+        if missing := await self._node.clock.beside(self._ready):
             self._node.log.fatal("expected %s, found none", missing)
         self._waiting.put((lambda _: first(), None))
         early, self._early = self._early or [], None
         for publish in early:
             publish()
 
-    def publish(self, put: Callable[..., object], what: object) -> None:
-        """Put something in its turn."""
-        self._once_there(self._waiting.put, (put, what))
+    def publish(self, call: Callable[..., object], value: object) -> None:
+        """Call `call` with a value, after all earlier calls."""
+        self._when_ready(self._waiting.put, (call, value))
 
     def publish_image(
-        self, image: Event, put: Callable[[Any], object], clock: Callable[[int], object]
+        self, image: Event, publish: Callable[[Any], object], clock: Callable[[int], object]
     ) -> None:
-        """Put the time (`clock`, ns), then an image or a point cloud; hold for the answers."""
-        self._once_there(self._publish_image, image, put, clock)
+        """Publish the time (`clock`, ns), then an image or a point cloud; hold for the answers."""
+        self._when_ready(self._publish_image, image, publish, clock)
 
     async def close(self) -> None:
         """Publish the remaining messages; give up after `CLOSING` if a peer does not read."""
@@ -225,14 +227,14 @@ class HeldLine:
         if self._thread.is_alive():
             await self._node.offload(self._thread.join, CLOSING)
 
-    def _once_there(self, call: Callable[..., object], *args: object) -> None:
+    def _when_ready(self, call: Callable[..., object], *args: object) -> None:
         if self._early is None:
             call(*args)
         elif self._node.clock.kind == "lockstep":
             self._early.append(functools.partial(call, *args))
 
     def _publish_image(
-        self, image: Event, put: Callable[[Any], object], clock: Callable[[int], object]
+        self, image: Event, publish: Callable[[Any], object], clock: Callable[[int], object]
     ) -> None:
         node = self._node
         if node.clock.kind == "real" and self._waiting.qsize() >= WAITING:
@@ -242,7 +244,7 @@ class HeldLine:
             if (owed := estimator.owe(image, self._matched)) is not None:
                 node.start(self._answer(owed))
         self._waiting.put((clock, node.clock.now()))
-        self._waiting.put((put, image))
+        self._waiting.put((publish, image))
 
     async def _answer(self, owed: Owed[Event]) -> None:
         event = await owed
@@ -255,34 +257,34 @@ class HeldLine:
         try:
             for estimator in self._estimators:
                 estimator.follow(self._session)
-            self._there.set_result(self._wait())
+            self._ready.set_result(self._wait_for_estimators())
         except Exception as error:
-            self._there.set_exception(error)
-        for put, what in iter(self._waiting.get, None):
+            self._ready.set_exception(error)
+        for call, value in iter(self._waiting.get, None):
             try:
-                put(what)
-            except Exception as error:  # nobody looks at this thread
+                call(value)
+            except Exception as error:  # reported by the holds, as this thread has no caller
                 for estimator in self._estimators:
                     estimator.hold.fail(error)
 
-    def _wait(self) -> str:
+    def _wait_for_estimators(self) -> str:
         """Wait for the estimators and their last subscription; return the missing ones in words."""
-        begin = since = time.monotonic()
-        end = begin + max(estimator.subscription.timeout for estimator in self._estimators)
+        start = unchanged_since = time.monotonic()
+        end = start + max(estimator.subscription.timeout for estimator in self._estimators)
         matched: list[str] = []
         while True:
             now, before, matched = time.monotonic(), matched, self._matched()
-            since = since if matched == before else now
+            unchanged_since = unchanged_since if matched == before else now
             missing = "; ".join(filter(None, (e.missing(matched) for e in self._estimators)))
-            if not missing and now > since + SETTLED:
+            if not missing and now > unchanged_since + SETTLED:
                 return ""
             if now > end or self._closed.wait(_LOOK):
-                return f"{missing or 'no further subscriptions'} within {end - begin:g} s"
+                return f"{missing or 'no further subscriptions'} within {end - start:g} s"
 
     def _matched(self) -> list[str]:
         return [publisher.topic.name for publisher in self._publishers if publisher.matched()]
 
-    def _note(self, publisher: Publisher, message: bytearray) -> None:
+    def _record_sent(self, publisher: Publisher, message: bytearray) -> None:
         """Add a message to the digest of each hold; raise if a subscriber does not read."""
         name = publisher.topic.name
         for estimator in self._estimators:
@@ -297,25 +299,26 @@ def why_no_answers(
     config: Ros2BridgeConfig, rates: Mapping[str, float], *, lockstep: bool
 ) -> Iterator[str]:
     """Yield why estimators could never answer, given the announced rates of cameras and lidars."""
-    for given in config.subscriptions:
-        source, latency = given.answers_to, float(given.latency)
-        if not source or given.use == "done":
+    for subscription in config.subscriptions:
+        source, latency = subscription.answers_to, float(subscription.latency)
+        if not source or subscription.use == "done":
             continue
         if source not in rates:
             yield (
-                f"{given.topic}: answers_to: expected a camera or lidar that is announced, found "
-                f'"{source}" (there are: {", ".join(rates) or "none"}){suggest(source, rates)}'
+                f"{subscription.topic}: answers_to: expected a camera or lidar that is announced, "
+                f'found "{source}" (there are: {", ".join(rates) or "none"})'
+                f"{suggest(source, rates)}"
             )
-        elif any(given.is_told_by(other) for other in config.subscriptions):
+        elif any(subscription.is_completed_by(other) for other in config.subscriptions):
             continue
         elif (
-            (lockstep and given.hold.skips == "allowed")
-            and not given.hold.latencies
+            (lockstep and subscription.hold.skips == "allowed")
+            and not subscription.hold.latencies
             and 0 < rates[source] * latency <= 1
         ):
             yield (
-                f'{given.topic}: skips = "allowed": expected a latency above the period of {source}'
-                f" ({1e3 / rates[source]:.4g} ms), found {latency * 1e3:g} ms: that an image was "
-                "skipped is known by the answer to a later one, which is not sent while time "
-                'stands for the first; or have a topic say what is done (as = "done")'
+                f'{subscription.topic}: skips = "allowed": expected a latency above the period of '
+                f"{source} ({1e3 / rates[source]:.4g} ms), found {latency * 1e3:g} ms: that an "
+                "image was skipped is known by the answer to a later one, which is not sent while "
+                'time stands for the first; or have a topic say what is done (as = "done")'
             )

@@ -61,14 +61,14 @@ class IncomingTopic:
 
     def announce(self) -> Iterator[Announcement]:
         """Announce the estimator or the pilot whose messages these are; else their source."""
-        given = self.subscription
-        if given.source:
+        subscription = self.subscription
+        if subscription.source:
             yield Announcement(stamp=0, source=self.source)
-        if given.use in {"velocity", "position", "pose"}:
-            yield PilotAnnouncement(stamp=0, source=self.source, vehicle=given.vehicle)
-        if given.use == "estimate":
-            method, scale_free = f"ROS 2: {self.topic.name}", given.scale_free
-            cameras = (given.answers_to,) if given.answers_to else ()
+        if subscription.use in {"velocity", "position", "pose"}:
+            yield PilotAnnouncement(stamp=0, source=self.source, vehicle=subscription.vehicle)
+        if subscription.use == "estimate":
+            method, scale_free = f"ROS 2: {self.topic.name}", subscription.scale_free
+            cameras = (subscription.answers_to,) if subscription.answers_to else ()
             yield EstimatorAnnouncement(
                 stamp=0,
                 source=self.source,
@@ -83,7 +83,7 @@ class IncomingTopic:
         """Subscribe to the calibration of a camera with these images; return the first, if any."""
         pending: concurrent.futures.Future[CameraAnnouncement] = concurrent.futures.Future()
 
-        def take(message: Message) -> None:
+        def receive(message: Message) -> None:
             if pending.done():
                 return
             try:
@@ -98,7 +98,7 @@ class IncomingTopic:
                 with contextlib.suppress(concurrent.futures.InvalidStateError):
                     pending.set_result(camera)
 
-        session.subscribe(self.topic, take, late=True)
+        session.subscribe(self.topic, receive, late=True)
         return pending
 
     def event(self, data: bytes, now: int, stamps: Stamps) -> Event | None:
@@ -182,12 +182,12 @@ class Inbox:
         self._max_size, self._complain, self._now = max_size, complain, now
         self._waiting: deque[bytes] = deque()
         self._lock = threading.Lock()
-        self._allowed, self._asked = float(depth), now()
+        self._allowed, self._checked_at = float(depth), now()
         self._woken = False
         self.wake_ups = 0
 
-    def take(self, message: Message) -> None:
-        """Take a message, in any thread; never waits."""
+    def receive(self, message: Message) -> None:
+        """Store a message, in any thread; never waits."""
         if message.size > self._max_size:
             fault = f"expected {self._max_size} bytes or less, found {message.size}"
             self._complain("message too large", fault)
@@ -209,11 +209,11 @@ class Inbox:
                 self._loop.call_soon_threadsafe(self._drain)
 
     def _within_rate(self) -> bool:
-        """Tell whether another message fits; each second allows for `max_rate` more."""
+        """Return whether another message is allowed: `max_rate` more each second."""
         with self._lock:
             now = self._now()
-            more = (now - self._asked) * self._max_rate
-            self._allowed, self._asked = min(self._allowed + more, float(self._depth)), now
+            more = (now - self._checked_at) * self._max_rate
+            self._allowed, self._checked_at = min(self._allowed + more, float(self._depth)), now
             if self._allowed < 1.0:
                 return False
             self._allowed -= 1.0
@@ -253,15 +253,15 @@ class OutgoingTopic:
         self.event = event_type(publication)
         self._map = import_mapping(publication.topic, publication.mapping)
 
-    def wants(self, event: Event) -> bool:
-        """Tell whether an event becomes a message."""
+    def accepts(self, event: Event) -> bool:
+        """Return whether an event becomes a message."""
         source = self.publication.source
         return isinstance(event, self.event) and (
             not source or event.source == source or event.source.startswith(f"{source}/")
         )
 
     def put(self, builder: MessageBuilder, event: Event) -> None:
-        """Put the message of an event, if any."""
+        """Publish the message of an event, if any."""
         if self.publisher is not None and (message := self.message(event, builder)) is not None:
             self.publisher.put(message)
 

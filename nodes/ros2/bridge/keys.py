@@ -164,16 +164,16 @@ class Complaints:
         self._logged: dict[tuple[str, str], tuple[float, int]] = {}
         self._lock = threading.Lock()
 
-    def add(self, where: str, kind: str, detail: str = "") -> None:
+    def add(self, place: str, kind: str, detail: str = "") -> None:
         """Count an error; log once per `LOG_INTERVAL`, topic and (one of a few) kind."""
         with self._lock:
-            key, now = (where, kind), self._now()
+            key, now = (place, kind), self._now()
             self.counts[key] += 1
-            when, before = self._logged.get(key, (-LOG_INTERVAL, 0))
-            if now - when < LOG_INTERVAL:
+            last_time, before = self._logged.get(key, (-LOG_INTERVAL, 0))
+            if now - last_time < LOG_INTERVAL:
                 return
             count = self.counts[key]
             self._logged[key] = (now, count)
-            since = count - before
-        times = f" ({since} times since the last such line)" if since > 1 else ""
-        self._log(f"{where}: {kind}{': ' if detail else ''}{detail:.300}{times}")
+            repeated = count - before
+        times = f" ({repeated} times since the last such line)" if repeated > 1 else ""
+        self._log(f"{place}: {kind}{': ' if detail else ''}{detail:.300}{times}")

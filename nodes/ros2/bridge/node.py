@@ -97,8 +97,8 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         config = self.config
         if config.time == "wall" and self.clock.kind != "real":
             self.log.fatal('time = "wall" needs clock = "real", found "%s"', self.clock.kind)
-        if config.paused and (why := self.stepping.fixed()):
-            self.log.fatal("paused: %s", why)
+        if config.paused and (reason := self.stepping.fixed()):
+            self.log.fatal("paused: %s", reason)
         if self._unheld and self.clock.kind != "real":
             self.log.warning(
                 "messages of ROS on %s come at their own time, so runs in lockstep will differ; "
@@ -157,12 +157,12 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
 
     def on_announcement(self, announcement: Announcement) -> None:
         """Declare the topics of an announcement."""
-        ours = {incoming.source for incoming in self._incoming}
+        own_sources = {incoming.source for incoming in self._incoming}
         if isinstance(announcement, CameraAnnouncement | LidarAnnouncement):
             self._rates[announcement.source] = announcement.rate
         if isinstance(announcement, VehicleAnnouncement):
             self._vehicles.append(announcement.source)
-        if self._publishing is not None and announcement.source not in ours:
+        if self._publishing is not None and announcement.source not in own_sources:
             self._publishing.announced(announcement)
 
     def check(self) -> Iterable[str]:
@@ -175,7 +175,7 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         assert publishing is not None
         assert session is not None
         self._open = True
-        if self.config.paused:  # before anybody can ask for anything
+        if self.config.paused:  # before any request can arrive
             self.stepping.pause()
         self._fix_time()
         if self._line is None:
@@ -186,11 +186,11 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             self.start(self._publish_all(events, publishing.put))
         for outgoing in self._outgoing:
             outgoing.publisher = (self._line or session).publisher(outgoing.topic)
-            put = functools.partial(outgoing.put, publishing.builder)
-            self.start(self._publish_all(outgoing.waiting, put))
+            publish = functools.partial(outgoing.put, publishing.builder)
+            self.start(self._publish_all(outgoing.waiting, publish))
         for incoming in self._incoming:
             if not incoming.subscription.answers_to and incoming.subscription.use != "camera":
-                await self.offload(session.subscribe, incoming.topic, self._inbox(incoming).take)
+                await self.offload(session.subscribe, incoming.topic, self._inbox(incoming).receive)
         if self.config.services:
             self._services = Services(self._send, self, session, self._store, self._complaints)
             await self.offload(self._services.offer, self._vehicles)
@@ -241,19 +241,19 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
 
     @on(VehicleEvent)
     def vehicle_events(self, event: VehicleEvent) -> None:
-        """Answer the requests of a vehicle's action, now done."""
+        """Answer the requests whose action a vehicle has completed."""
         if self._services is not None:
-            self._services.told(event)
+            self._services.handle_event(event)
 
     def publications(self, event: Event) -> None:
         """Publish, beside the loop, the messages of the user's own mappings."""
         for outgoing in self._outgoing:
-            if outgoing.wants(event):
+            if outgoing.accepts(event):
                 if self._line is None or self._publishing is None:
                     outgoing.waiting.offer(event)
                 else:
-                    put = functools.partial(outgoing.put, self._publishing.builder)
-                    self._line.publish(put, event)
+                    publish = functools.partial(outgoing.put, self._publishing.builder)
+                    self._line.publish(publish, event)
 
     @every(hz="clock_rate")
     def publish_clock(self, tick: Tick) -> None:  # noqa: ARG002
@@ -274,16 +274,16 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
             listening=[*declared.listening, "publications"],
         )
 
-    def _publish(self, put: Callable[[Any], None], what: Any) -> None:
+    def _publish(self, publish: Callable[[Any], None], value: Any) -> None:
         """Publish a small message, at once or in its turn."""
         if self._line is None:
-            put(what)
+            publish(value)
         else:
-            self._line.publish(put, what)
+            self._line.publish(publish, value)
 
-    async def _publish_all(self, events: Stream[Any], put: Callable[[Any], None]) -> None:
+    async def _publish_all(self, events: Stream[Any], publish: Callable[[Any], None]) -> None:
         async for event in events:
-            await self.offload(put, event)
+            await self.offload(publish, event)
 
     async def _read_images(self, incoming: IncomingTopic, waiting: Stream[bytes]) -> None:
         async for data in waiting:
@@ -300,17 +300,17 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
                 if event is not None:
                     self._send(event)
 
-        take: Callable[[bytes], object] = deliver
+        handler: Callable[[bytes], object] = deliver
         reader = READERS.get((subscription.type, subscription.use))
         if reader is not None and reader.large:
             name = f"{self.name}.{incoming.topic.name}"
             waiting = Stream[bytes](name, subscription.depth, "drop_oldest", soon=True)
             self._unread.append(waiting)
             self.start(self._read_images(incoming, waiting))
-            take = waiting.offer
+            handler = waiting.offer
         return Inbox(
             asyncio.get_running_loop(),
-            take,
+            handler,
             depth=subscription.depth,
             max_rate=subscription.max_rate,
             max_size=self.config.max_message_size,
@@ -323,11 +323,11 @@ class Ros2Bridge(Node[Ros2BridgeConfig]):
         getattr(self, port).send(event)
 
     async def _find_camera(self, session: Session, incoming: IncomingTopic) -> None:
-        timeout, most = incoming.subscription.timeout, self.config.max_message_size
+        timeout, max_size = incoming.subscription.timeout, self.config.max_message_size
         kinds = {"image": "rgb", "depth": "depth"}
         uses = [t.subscription.use for t in self._incoming if t.source == incoming.source]
         images = tuple(kinds[use] for use in uses if use in kinds)
-        pending = await self.offload(incoming.find_camera, session, images, most)
+        pending = await self.offload(incoming.find_camera, session, images, max_size)
         try:
             self._cameras.append(await self.offload(pending.result, timeout))
         except TimeoutError:

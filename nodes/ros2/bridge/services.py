@@ -62,58 +62,60 @@ class ServiceServer:
         self._lock = threading.Lock()
         self._waiting = self._answered = 0
         self._closed = False
-        # Not `Node.offload`: simulated time need not wait for whoever asked.
-        self._out = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="answers")
+        # Not `Node.offload`: simulated time does not wait for clients.
+        self._executor = concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="answers")
 
     def declare(self, name: str, type_: str, serve: Serve) -> None:
         """Declare a service, relative to the namespace, in any thread; `serve` runs on the loop."""
         for part in ("_Request", "_Response"):  # the first of each takes milliseconds
-            written = self.store.serialize(self.store.zero(type_ + part))
-            self.store.deserialize(bytes(written), type_ + part)
+            sample = self.store.serialize(self.store.zero(type_ + part))
+            self.store.deserialize(bytes(sample), type_ + part)
         name = topic_name(self.node.config.namespace, name)
         service = Topic(name=name, type=type_, hash=self.store.hash(type_))
-        self._session.serve(service, functools.partial(self._take, service, serve))
+        self._session.serve(service, functools.partial(self._receive_request, service, serve))
 
     def publisher(self, name: str, type_: str, qos: Qos) -> Callable[..., None]:
         """Declare a topic; return a function to publish messages of given fields, in order."""
         self.store.serialize(self.store.zero(type_))  # the first takes milliseconds
         name = topic_name(self.node.config.namespace, name)
         topic = Topic(name=name, type=type_, hash=self.store.hash(type_), qos=qos)
-        make, put = self.store.message(type_), self._session.publisher(topic).put
-        return lambda **fields: self._send(put, self.store.serialize(make(**fields)))
+        make, publish = self.store.message(type_), self._session.publisher(topic).put
+        return lambda **fields: self._send(publish, self.store.serialize(make(**fields)))
 
     async def close(self) -> None:
-        """Take no more requests, and wait until all answers are sent."""
+        """Stop accepting requests, and wait until all answers are sent."""
         self._closed = True
-        await self.node.offload(self._out.shutdown)
+        await self.node.offload(self._executor.shutdown)
         self.node.log.info("%d requests answered", self._answered)
 
-    def _take(self, service: Topic, serve: Serve, message: Message, answer: Answer) -> None:
+    def _receive_request(
+        self, service: Topic, serve: Serve, message: Message, answer: Answer
+    ) -> None:
         """Read a request in a thread of Zenoh's, and hand the request to the loop."""
-        wrong, request, attachment = "", None, message.attachment
-        most = self.node.config.max_message_size
+        problem, request, attachment = "", None, message.attachment
+        max_size = self.node.config.max_message_size
         with self._lock:
             self._waiting += 1
             waiting = self._waiting
         if waiting > WAITING:
-            wrong = f"expected {WAITING} requests that wait or fewer"
+            problem = f"expected {WAITING} requests that wait or fewer"
         elif attachment is None:
-            wrong = "expected an attachment with a number and a GID"
-        elif message.size > most:
-            wrong = f"expected {most} bytes or less, found {message.size}"
+            problem = "expected an attachment with a number and a GID"
+        elif message.size > max_size:
+            problem = f"expected {max_size} bytes or less, found {message.size}"
         else:
             try:
                 request = self.store.deserialize(message.read(), f"{service.type}_Request")
             except MessageError as error:
-                wrong = f"expected a {service.type}_Request: {error}"
+                problem = f"expected a {service.type}_Request: {error}"
         finish = functools.partial(self._finish, service.name, answer, attachment)
-        if wrong:
-            finish(wrong)
+        if problem:
+            finish(problem)
             return
         with contextlib.suppress(RuntimeError):  # the loop has been closed
-            self.loop.call_soon_threadsafe(self._begin, service.type, serve, request, finish)
+            self.loop.call_soon_threadsafe(self._start_answer, service.type, serve, request, finish)
 
-    def _begin(self, *request: Any) -> None:
+    def _start_answer(self, *request: Any) -> None:
         if not self._closed:
             self.node.start(self._answer(*request))
 
@@ -125,7 +127,7 @@ class ServiceServer:
             self._answered += 1
         except Exception as error:  # what comes from outside must not end the run
             reply = str(error) if isinstance(error, VisnavError) else repr(error)
-        finally:  # cancelled, too: whoever asked must not wait for ever
+        finally:  # cancelled, too: the client must not wait for ever
             finish(reply)
 
     def _finish(
@@ -140,7 +142,7 @@ class ServiceServer:
 
     def _send(self, *call: Any) -> None:
         with contextlib.suppress(RuntimeError):  # closed, and with it soon the session
-            self._out.submit(*call)
+            self._executor.submit(*call)
 
 
 # Of SimulatorFeatures.msg.
@@ -177,8 +179,8 @@ class SimulationServices:
 
     def refusal(self, steps: int) -> tuple[int, str] | None:
         """Return why so many steps cannot be done now, as result and text; `None` if they can."""
-        if why := self._stepping.fixed():
-            return FEATURE_UNSUPPORTED, why
+        if reason := self._stepping.fixed():
+            return FEATURE_UNSUPPORTED, reason
         if (state := self._stepping.state) != "paused":
             return OPERATION_FAILED, f"expected time to stand, found it {state}"
         most = LONGEST // self.step
@@ -192,30 +194,30 @@ class SimulationServices:
 
     async def _features(self, _: Any) -> dict[str, Any]:
         ids = [STATE_GETTING, STATE_SETTING]
-        why = self._stepping.fixed()
-        if not why:
+        reason = self._stepping.fixed()
+        if not reason:
             ids += [STATE_PAUSE, STEP_SINGLE, STEP_MULTIPLE, STEP_ACTION]
-        info = why or f"a step is {self.step / SECOND:g} s of simulated time"
+        info = reason or f"a step is {self.step / SECOND:g} s of simulated time"
         kind, features = "SimulatorFeatures", np.array(ids, np.uint16)
-        made = self._make(kind, features=features, spawn_formats=[], custom_info=info)
-        return {"features": made}
+        message = self._make(kind, features=features, spawn_formats=[], custom_info=info)
+        return {"features": message}
 
     async def _state(self, _: Any) -> dict[str, Any]:
         state = self._make("SimulationState", state=self._now())
         return {"state": state, **self.result(OK)}
 
     async def _set_state(self, request: Any) -> dict[str, Any]:
-        wanted = request.state.state
-        if wanted in {STOPPED, QUITTING}:
+        target = request.state.state
+        if target in {STOPPED, QUITTING}:
             self._server.node.stop("ended by ROS")
             return self.result(OK)
-        if wanted not in {PLAYING, PAUSED}:
-            return self.result(INCORRECT_TRANSITION, f"expected a state of 0 to 3, found {wanted}")
-        if wanted == self._now():
+        if target not in {PLAYING, PAUSED}:
+            return self.result(INCORRECT_TRANSITION, f"expected a state of 0 to 3, found {target}")
+        if target == self._now():
             return self.result(ALREADY_IN_TARGET_STATE)
-        if why := self._stepping.fixed():
-            return self.result(FEATURE_UNSUPPORTED, why)
-        if wanted == PLAYING:
+        if reason := self._stepping.fixed():
+            return self.result(FEATURE_UNSUPPORTED, reason)
+        if target == PLAYING:
             self._stepping.resume()
         else:
             self._stepping.pause()
@@ -225,9 +227,9 @@ class SimulationServices:
         if refusal := self.refusal(request.steps):
             return self.result(*refusal)
         ns = request.steps * self.step
-        if (gone := await self._stepping.step(ns)) < ns:
-            what = f"ended after {gone / SECOND:g} of {ns / SECOND:g} s: by another request"
-            return self.result(OPERATION_FAILED, what)
+        if (elapsed := await self._stepping.step(ns)) < ns:
+            text = f"ended after {elapsed / SECOND:g} of {ns / SECOND:g} s: by another request"
+            return self.result(OPERATION_FAILED, text)
         return self.result(OK)
 
     async def _reset(self, _: Any) -> dict[str, Any]:
@@ -243,14 +245,14 @@ class SimulationServices:
 # Of GoalStatus.msg, and of CancelGoal.srv.
 UNKNOWN, EXECUTING, CANCELING, SUCCEEDED, CANCELED, ABORTED = 0, 2, 3, 4, 5, 6
 NO_ERROR, UNKNOWN_GOAL, GOAL_TERMINATED = 0, 2, 3
-KEPT, PERIOD = 16, 0.2  # goals with kept results; real seconds between feedback messages
+STORED_RESULTS, PERIOD = 16, 0.2  # goals with kept results; real seconds between feedback messages
 
 
 class _Goal:
-    """A client's goal: steps from simulated time `begin` (ns); `info` is its GoalInfo."""
+    """A client's goal: steps from simulated time `start_time` (ns); `info` is its GoalInfo."""
 
-    def __init__(self, info: Any, steps: int, begin: int) -> None:
-        self.info, self.steps, self.begin = info, steps, begin
+    def __init__(self, info: Any, steps: int, start_time: int) -> None:
+        self.info, self.steps, self.start_time = info, steps, start_time
         self.status, self.result, self.over = EXECUTING, dict[str, Any](), asyncio.Event()
 
 
@@ -268,7 +270,7 @@ class SimulateSteps:
         below, array = "simulate_steps/_action", "action_msgs/msg/GoalStatusArray"
         declare, publisher = self._server.declare, self._server.publisher
         self._status = publisher(f"{below}/status", array, Qos(transient_local=True, depth=1))
-        self._news = publisher(f"{below}/feedback", f"{STEPS}_FeedbackMessage", Qos())
+        self._feedback_publisher = publisher(f"{below}/feedback", f"{STEPS}_FeedbackMessage", Qos())
         declare(f"{below}/cancel_goal", CANCEL_GOAL, self._cancel)
         declare(f"{below}/get_result", f"{STEPS}_GetResult", self._get_result)
         declare(f"{below}/send_goal", f"{STEPS}_SendGoal", self._send_goal)
@@ -279,7 +281,7 @@ class SimulateSteps:
         stamp = self._message("builtin_interfaces/msg/Time")(sec=sec, nanosec=nanosec)
         if id_ in self._goals:
             return {"accepted": False, "stamp": stamp}
-        if len(self._goals) == KEPT:
+        if len(self._goals) == STORED_RESULTS:
             del self._goals[next(k for k, goal in self._goals.items() if goal.over.is_set())]
         info = self._message("action_msgs/msg/GoalInfo")(goal_id=request.goal_id, stamp=stamp)
         goal = self._goals[id_] = _Goal(info, steps, now)
@@ -289,38 +291,40 @@ class SimulateSteps:
             self._set(goal, EXECUTING)
             stepped = self._stepping.step(steps * self._simulation.step)
             stepped.add_done_callback(functools.partial(self._stepped, goal))
-            threading.Thread(target=self._tell_often, args=(goal,), daemon=True).start()
+            threading.Thread(
+                target=self._publish_feedback_until_over, args=(goal,), daemon=True
+            ).start()
         return {"accepted": True, "stamp": stamp}
 
-    def _tell_often(self, goal: _Goal) -> None:
-        """Have feedback published while steps go on, by a thread: the loop's time is simulated."""
+    def _publish_feedback_until_over(self, goal: _Goal) -> None:
+        """Publish feedback during steps, from a thread, as the loop's time is simulated."""
         with contextlib.suppress(RuntimeError):  # the loop has been closed
             while not goal.over.is_set():
                 time.sleep(PERIOD)
-                gone = self._clock.now() - goal.begin
-                self._server.loop.call_soon_threadsafe(self._tell, goal, gone)
+                elapsed = self._clock.now() - goal.start_time
+                self._server.loop.call_soon_threadsafe(self._publish_feedback, goal, elapsed)
 
-    def _tell(self, goal: _Goal, gone: int) -> int:
-        """Publish and return the number of steps done after `gone` ns."""
-        done = min(gone // self._simulation.step, goal.steps)
+    def _publish_feedback(self, goal: _Goal, elapsed: int) -> int:
+        """Publish and return the number of steps done after `elapsed` ns."""
+        done = min(elapsed // self._simulation.step, goal.steps)
         if not goal.over.is_set():
             counts = {"completed_steps": done, "remaining_steps": goal.steps - done}
             feedback = self._message(f"{STEPS}_Feedback")(**counts)
-            self._news(goal_id=goal.info.goal_id, feedback=feedback)
+            self._feedback_publisher(goal_id=goal.info.goal_id, feedback=feedback)
         return done
 
     def _stepped(self, goal: _Goal, stepped: asyncio.Future[int]) -> None:
-        done = self._tell(goal, stepped.result())
-        what = f"after {done} of {goal.steps} steps"
+        done = self._publish_feedback(goal, stepped.result())
+        progress = f"after {done} of {goal.steps} steps"
         if done == goal.steps:
             self._set(goal, SUCCEEDED, OK)
         elif goal.status == CANCELING:
-            self._set(goal, CANCELED, OPERATION_FAILED, f"canceled {what}")
+            self._set(goal, CANCELED, OPERATION_FAILED, f"canceled {progress}")
         else:
-            self._set(goal, ABORTED, OPERATION_FAILED, f"ended from elsewhere {what}")
+            self._set(goal, ABORTED, OPERATION_FAILED, f"ended from elsewhere {progress}")
 
     def _set(self, goal: _Goal, status: int, *result: Any) -> None:
-        """Publish a status; with a result the goal is over, once and for all."""
+        """Publish a status; a result ends the goal for good."""
         if goal.over.is_set():
             return
         if result:
@@ -328,14 +332,16 @@ class SimulateSteps:
             goal.over.set()
         goal.status = status
         make, goals = self._message("action_msgs/msg/GoalStatus"), self._goals.values()
-        self._status(status_list=[make(goal_info=it.info, status=it.status) for it in goals])
+        self._status(
+            status_list=[make(goal_info=entry.info, status=entry.status) for entry in goals]
+        )
 
     async def _get_result(self, request: Any) -> dict[str, Any]:
         status, result = UNKNOWN, self._simulation.result(OPERATION_FAILED, "no such goal is known")
         if goal := self._goals.get(bytes(request.goal_id.uuid)):
             try:
                 await goal.over.wait()
-            except asyncio.CancelledError:  # whoever asked must not wait for ever
+            except asyncio.CancelledError:  # the client must not wait for ever
                 self._set(goal, ABORTED, OPERATION_FAILED, "the run has ended")
             status, result = goal.status, goal.result
         return {"status": status, "result": self._message(f"{STEPS}_Result")(**result)}
@@ -345,8 +351,8 @@ class SimulateSteps:
         id_, stamp = bytes(request.goal_info.goal_id.uuid), request.goal_info.stamp
         until = stamp.sec * SECOND + stamp.nanosec
         for goal_id, goal in self._goals.items():
-            before = goal.begin <= until if until else not any(id_)
-            if not goal.over.is_set() and (goal_id == id_ or before):
+            matches_time = goal.start_time <= until if until else not any(id_)
+            if not goal.over.is_set() and (goal_id == id_ or matches_time):
                 self._set(goal, CANCELING)
                 self._stepping.pause()
                 return {"return_code": NO_ERROR, "goals_canceling": [goal.info]}
@@ -388,12 +394,12 @@ class VehicleServices:
         for name, order in _ORDERS.items():
 
             async def serve(_: Any, order: _Order = order) -> dict[str, Any]:
-                success, message = await self._give(vehicle, order)
+                success, message = await self._execute(vehicle, order)
                 return {"success": success, "message": message}
 
             self._server.declare(f"{ros_name(vehicle)}/{name}", TRIGGER, serve)
 
-    def told(self, event: VehicleEvent) -> None:
+    def handle_event(self, event: VehicleEvent) -> None:
         """Record a vehicle's event, and complete the requests waiting for its type."""
         if isinstance(event, events.Armed | events.Disarmed):
             self._armed[event.source] = isinstance(event, events.Armed)
@@ -401,7 +407,7 @@ class VehicleServices:
             if vehicle == event.source and isinstance(event, done) and not waiter.done():
                 waiter.set_result(None)
 
-    async def _give(self, vehicle: str, order: _Order) -> tuple[bool, str]:
+    async def _execute(self, vehicle: str, order: _Order) -> tuple[bool, str]:
         if self._armed.get(vehicle) is order.superfluous is not None:
             return True, f"{vehicle} is {'armed' if order.superfluous else 'disarmed'} already"
         waiter = asyncio.get_running_loop().create_future()
@@ -410,7 +416,7 @@ class VehicleServices:
         try:
             now, source = self._node.clock.now(), self._node.name
             self._send(order.command(stamp=now, source=source, vehicle=vehicle))
-            if self._node.stepping.state == "paused":  # whoever asked is the one who steps
+            if self._node.stepping.state == "paused":  # the client itself steps the time
                 return True, f"{order.command.__name__} is sent; time stands"
             async with asyncio.timeout(order.limit):
                 await waiter
@@ -428,7 +434,7 @@ class Services(ServiceServer):
     def __init__(self, send: Callable[[Command], None], *server: Any) -> None:
         super().__init__(*server)
         self._vehicles = VehicleServices(self, send)
-        self.told = self._vehicles.told
+        self.handle_event = self._vehicles.handle_event
 
     def offer(self, vehicles: Iterable[str]) -> None:
         """Declare all services of the settings, for these vehicles; called in a thread."""

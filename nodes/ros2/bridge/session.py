@@ -57,47 +57,47 @@ class Publisher:
         self,
         topic: Topic,
         put: Callable[..., object],
-        matched: Callable[[], bool],  # tells whether somebody subscribes to the topic
+        matched: Callable[[], bool],  # returns whether the topic has a subscriber
         gid_: bytes | None,  # of the endpoint; if ``None``, messages have no attachment
         max_wait: float,
     ) -> None:
         self.topic, self.matched = topic, matched
         self.sent = self.failed = 0
-        # Called with each message put.
-        self.note: Callable[[Publisher, bytearray], None] | None = None
+        # Called with each published message.
+        self.on_put: Callable[[Publisher, bytearray], None] | None = None
         self._put, self._gid, self._max_wait = put, gid_, max_wait
         depth = topic.qos.depth if topic.qos.transient_local else 0
         # The last messages and their attachments, if the topic is transient local.
-        self.kept: deque[tuple[bytes, bytes | None]] = deque(maxlen=depth)
+        self.history: deque[tuple[bytes, bytes | None]] = deque(maxlen=depth)
 
     def put(self, message: bytearray) -> None:
-        """Put a message; its bytes may be overwritten afterwards."""
-        attachment, begin = None, time.monotonic()
+        """Publish a message; its bytes may be overwritten afterwards."""
+        attachment, start = None, time.monotonic()
         if self._gid is not None:
             number = self.sent + self.failed + 1
             attachment = pack(Attachment(number, time.time_ns(), self._gid))
-        if self.kept.maxlen:
-            self.kept.append((bytes(message), attachment))
+        if self.history.maxlen:
+            self.history.append((bytes(message), attachment))
         try:
             self._put(message, attachment=attachment)
         except zenoh.ZError:  # the session is closed
-            gone_out = False
-        else:  # Zenoh says nothing of a message that it gives up
-            gone_out = time.monotonic() - begin < self._max_wait
-        self.sent += gone_out
-        self.failed += not gone_out
-        if self.note is not None:
-            self.note(self, message)
+            delivered = False
+        else:  # Zenoh does not report a dropped message
+            delivered = time.monotonic() - start < self._max_wait
+        self.sent += delivered
+        self.failed += not delivered
+        if self.on_put is not None:
+            self.on_put(self, message)
 
 
-Take = Callable[[Message], None]  # called in a thread with each message
+MessageCallback = Callable[[Message], None]  # called in a thread with each message
 Answer = Callable[[bytearray | str, bytes], None]  # of a request: message and attachment, or error
 WAIT_BEFORE_DROP = 300  # microseconds of a put's wait for a peer; Zenoh's default is 1000
 WAITING = 64  # unread messages kept by Zenoh; with more, the sender has to wait
 PAUSE = 0.001  # seconds between two polls for messages; faster messages are taken in batches
 CLOSING = 3.0  # seconds
 _QUEUE = "transport/link/tx/queue/congestion_control"
-_OURS: dict[str, Any] = {
+_DEFAULTS: dict[str, Any] = {
     "mode": "peer",
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": True,
@@ -151,9 +151,9 @@ class Session:
             ) from error
         self.zid = str(self._session.info.zid())
         self._ids = itertools.count(1)
-        self._kept: list[Any] = []
+        self._declarations: list[Any] = []
         if keys == "rmw_zenoh":
-            self._keep(node_token(node, self.zid, 0))
+            self._declare_token(node_token(node, self.zid, 0))
 
     def publisher(self, topic: Topic, *, held: bool = False) -> Publisher:
         """Declare a publisher, visible to ROS.
@@ -166,15 +166,15 @@ class Session:
             topic = msgspec.structs.replace(topic, qos=qos)
         qos, key, reliability = topic.qos, self._key(topic), zenoh.Reliability
         block, drop = zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
-        waits = qos.reliable and qos.keep_all
+        blocks = qos.reliable and qos.keep_all
         options: dict[str, Any] = {
-            "congestion_control": block if waits else drop,
+            "congestion_control": block if blocks else drop,
             "reliability": reliability.RELIABLE if qos.reliable else reliability.BEST_EFFORT,
         }
         plain: Any = self._session.declare_publisher(key, **options)
         declared = plain
         if qos.transient_local:
-            # So often it is told what the last message was, as in rmw_publisher_data.cpp.
+            # Subscribers learn the last message's number so often, as in rmw_publisher_data.cpp.
             heartbeat = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
             declared = zenoh.ext.declare_advanced_publisher(
                 self._session,
@@ -188,15 +188,15 @@ class Session:
             topic,
             declared.put,
             lambda: plain.matching_status.matching,  # an advanced publisher does not know
-            self._show(topic, "MP"),
-            self._max_wait if waits else math.inf,
+            self._declare_endpoint(topic, "MP"),
+            self._max_wait if blocks else math.inf,
         )
         if qos.transient_local:
             answer = functools.partial(_answer, publisher, key)
-            self._kept.append(self._session.declare_queryable(key, answer, complete=True))
+            self._declarations.append(self._session.declare_queryable(key, answer, complete=True))
         return publisher
 
-    def subscribe(self, topic: Topic, take: Take, *, late: bool = False) -> None:
+    def subscribe(self, topic: Topic, callback: MessageCallback, *, late: bool = False) -> None:
         """Declare a subscription, visible to ROS; with `late`, kept messages come too."""
         # Not called by Zenoh for each message: each call takes the interpreter from the loop, and
         # under a flood the loop would wait for it again and again.
@@ -214,30 +214,30 @@ class Session:
             )
         else:
             subscriber = self._session.declare_subscriber(key, channel)
-        self._kept.append(subscriber)
+        self._declarations.append(subscriber)
         threading.Thread(
-            target=_read, args=(subscriber, take), name=f"reads {topic.name}", daemon=True
+            target=_read, args=(subscriber, callback), name=f"reads {topic.name}", daemon=True
         ).start()
-        self._show(topic, "MS")
+        self._declare_endpoint(topic, "MS")
 
-    def subscribe_in_order(self, takes: Sequence[tuple[Topic, Take]]) -> None:
+    def subscribe_in_order(self, callbacks: Sequence[tuple[Topic, MessageCallback]]) -> None:
         """Subscribe to topics in a common order of arrival, at more cost than by `subscribe`."""
-        came: queue.Queue[tuple[Take, zenoh.Sample] | None] = queue.Queue(WAITING)
+        samples: queue.Queue[tuple[MessageCallback, zenoh.Sample] | None] = queue.Queue(WAITING)
 
-        def queue_for(take: Take) -> Any:
-            put, closed = lambda sample: came.put((take, sample)), lambda: came.put(None)
+        def queue_for(callback: MessageCallback) -> Any:
+            put, closed = lambda sample: samples.put((callback, sample)), lambda: samples.put(None)
             return zenoh.handlers.Callback(put, closed, indirect=False)
 
         def read() -> None:
-            for _ in takes:  # until each is closed
-                for take, sample in iter(came.get, None):
-                    take(_message(sample))
+            for _ in callbacks:  # until each is closed
+                for callback, sample in iter(samples.get, None):
+                    callback(_message(sample))
 
-        for topic, take in takes:
-            subscriber = self._session.declare_subscriber(self._key(topic), queue_for(take))
-            self._kept.append(subscriber)
-            self._show(topic, "MS")
-        threading.Thread(target=read, name=f"reads {takes[0][0].name}", daemon=True).start()
+        for topic, callback in callbacks:
+            subscriber = self._session.declare_subscriber(self._key(topic), queue_for(callback))
+            self._declarations.append(subscriber)
+            self._declare_endpoint(topic, "MS")
+        threading.Thread(target=read, name=f"reads {callbacks[0][0].name}", daemon=True).start()
 
     def watch(self, topic_name: str, kind: Kind, changed: Callable[[bool, Token], None]) -> None:
         """Report the endpoints of other sessions on a topic, now and at each change.
@@ -249,7 +249,7 @@ class Session:
             changed: Called in any thread with an endpoint's presence and token.
         """
 
-        def tell(sample: zenoh.Sample) -> None:
+        def report(sample: zenoh.Sample) -> None:
             try:
                 token = parse_token(str(sample.key_expr))
             except ValueError:
@@ -259,24 +259,24 @@ class Session:
 
         key = endpoints_key(self._node.domain_id, kind, topic_name)
         liveliness = self._session.liveliness()
-        self._kept.append(liveliness.declare_subscriber(key, tell, history=True))
+        self._declarations.append(liveliness.declare_subscriber(key, report, history=True))
 
-    def serve(self, service: Topic, take: Callable[[Message, Answer], None]) -> None:
-        """Declare a service, visible to ROS; `take` gets requests in a thread: no waiting."""
+    def serve(self, service: Topic, callback: Callable[[Message, Answer], None]) -> None:
+        """Declare a service, visible to ROS; `callback` gets requests in a thread: no waiting."""
         key = data_key(self._node.domain_id, service)
 
         def answer(query: zenoh.Query, reply: bytearray | str, attachment: bytes) -> None:
-            with contextlib.suppress(zenoh.ZError), query:  # whoever asked may have gone
+            with contextlib.suppress(zenoh.ZError), query:  # the client may have gone
                 if isinstance(reply, str):
                     query.reply_err(reply)
                 else:
                     query.reply(key, reply, attachment=attachment)
 
-        def ask(query: zenoh.Query) -> None:
-            take(_message(query), functools.partial(answer, query))
+        def receive(query: zenoh.Query) -> None:
+            callback(_message(query), functools.partial(answer, query))
 
-        self._kept.append(self._session.declare_queryable(key, ask, complete=True))
-        self._show(service, "SS")
+        self._declarations.append(self._session.declare_queryable(key, receive, complete=True))
+        self._declare_endpoint(service, "SS")
 
     def close(self) -> bool:
         """Close the session; return whether done within `CLOSING`.
@@ -294,32 +294,32 @@ class Session:
             return ros2dds_key(topic)
         return data_key(self._node.domain_id, topic)
 
-    def _show(self, topic: Topic, kind: Kind) -> bytes | None:
-        """Show an endpoint to ROS, and return its GID; ``None`` if no ROS speaks these keys."""
+    def _declare_endpoint(self, topic: Topic, kind: Kind) -> bytes | None:
+        """Declare an endpoint to ROS, and return its GID; ``None`` if the keys are not ROS's."""
         if self._keys != "rmw_zenoh":
             return None
         token = endpoint_token(self._node, self.zid, 0, next(self._ids), kind, topic)
-        self._keep(token)
+        self._declare_token(token)
         return gid(token)
 
-    def _keep(self, token: str) -> None:
-        self._kept.append(self._session.liveliness().declare_token(token))
+    def _declare_token(self, token: str) -> None:
+        self._declarations.append(self._session.liveliness().declare_token(token))
 
 
 def _answer(publisher: Publisher, key: str, query: zenoh.Query) -> None:
-    """Send the kept messages to a late joiner asking for the topic's key, without `@adv`."""
-    for message, attachment in tuple(publisher.kept):
-        with contextlib.suppress(zenoh.ZError):  # whoever asked may have gone
+    """Send the stored messages to a late joiner asking for the topic's key, without `@adv`."""
+    for message, attachment in tuple(publisher.history):
+        with contextlib.suppress(zenoh.ZError):  # the subscriber may have gone
             query.reply(key, message, attachment=attachment)
 
 
-def _read(subscriber: Any, take: Take) -> None:
-    """Take messages, in a thread, until the subscription or the session is closed."""
+def _read(subscriber: Any, callback: MessageCallback) -> None:
+    """Read messages, in a thread, until the subscription or the session is closed."""
     with contextlib.suppress(zenoh.ZError):
         sample = subscriber.recv()
         while True:
             while sample is not None:
-                take(_message(sample))
+                callback(_message(sample))
                 sample = subscriber.try_recv()
             time.sleep(PAUSE)
             sample = subscriber.recv()
@@ -346,18 +346,18 @@ def _configuration(
             raise SessionError(
                 f"zenoh_config: {file}: expected a Zenoh configuration, found: {_reason(error)}"
             ) from error
-    for key, value in _OURS.items():
+    for key, value in _DEFAULTS.items():
         if configuration.get_json(key) == plain.get_json(key):
             configuration.insert_json5(key, json.dumps(value))
     # The cache of an advanced publisher needs it.
     configuration.insert_json5("timestamping/enabled", "true")
-    for way, endpoints in (("connect", connect), ("listen", listen)):
+    for setting, endpoints in (("connect", connect), ("listen", listen)):
         if endpoints is not None:
             try:
-                configuration.insert_json5(f"{way}/endpoints", json.dumps(endpoints))
+                configuration.insert_json5(f"{setting}/endpoints", json.dumps(endpoints))
             except zenoh.ZError as error:
                 raise SessionError(
-                    f'{way}: expected endpoints such as "tcp/127.0.0.1:7447", '
+                    f'{setting}: expected endpoints such as "tcp/127.0.0.1:7447", '
                     f"found {list(endpoints)}: {_reason(error)}"
                 ) from error
     return configuration

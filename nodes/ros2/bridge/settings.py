@@ -111,8 +111,8 @@ class Subscription(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         """Return the quality of service."""
         return Qos(reliable=self.reliable, transient_local=self.transient_local, depth=self.depth)
 
-    def is_told_by(self, other: Subscription) -> bool:
-        """Tell whether `other` has the ``done`` messages of this estimate."""
+    def is_completed_by(self, other: Subscription) -> bool:
+        """Return whether `other` has the ``done`` messages of this estimate."""
         return (
             (self.use, other.use) == ("estimate", "done")
             and self.answers_to == other.answers_to
@@ -159,9 +159,9 @@ class OwnPublication(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         return Qos(reliable=self.reliable, transient_local=self.transient_local, depth=self.depth)
 
 
-def _importable(topic: str, what: str, form: str, path: str) -> None:
+def _importable(topic: str, setting: str, form: str, path: str) -> None:
     if not re.fullmatch(r"\w+(\.\w+)*:\w+", path):
-        raise ValueError(f'{topic}: {what}: expected "{form}", found {path!r}')
+        raise ValueError(f'{topic}: {setting}: expected "{form}", found {path!r}')
 
 
 class Ros2BridgeConfig(PublishingConfig):
@@ -227,7 +227,7 @@ class Ros2BridgeConfig(PublishingConfig):
                 f'nodes are seen to go, found keys = "{self.keys}"'
             )
         for done in (s for s in self.subscriptions if s.use == "done"):
-            if len([s for s in self.subscriptions if s.is_told_by(done)]) != 1:
+            if len([s for s in self.subscriptions if s.is_completed_by(done)]) != 1:
                 raise ValueError(
                     f'{done.topic}: as = "done": expected one estimate with the same answers_to, '
                     "and of the same source if there are several"

@@ -90,9 +90,9 @@ def estimate_with_covariance(message: Any, context: MessageContext) -> Event:
     covariance = message.pose.covariance
     if not np.isfinite(covariance).all():
         raise ValueError("covariance: expected finite numbers")
-    given = covariance if covariance.any() else ()
+    values = covariance if covariance.any() else ()
     child = getattr(message, "child_frame_id", "") or "base_link"
-    return _estimate(message.header, message.pose.pose, given, context, child)
+    return _estimate(message.header, message.pose.pose, values, context, child)
 
 
 def newest(message: Any, context: MessageContext) -> Event:
@@ -334,7 +334,7 @@ def _estimate(
 ) -> Event:
     frame_id = context.frame(header, "odom")
     place, orientation = _pose(pose, frame_id, child)
-    given = convert_covariance(axes_of(frame_id), covariance).tolist() if len(covariance) else ()
+    values = convert_covariance(axes_of(frame_id), covariance).tolist() if len(covariance) else ()
     return context.event(
         PoseEstimate,
         header,
@@ -342,7 +342,7 @@ def _estimate(
         child_frame_id=child,
         position=place,
         orientation=orientation,
-        covariance=tuple(given),
+        covariance=tuple(values),
     )
 
 

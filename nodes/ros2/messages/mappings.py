@@ -263,9 +263,12 @@ def described_uses() -> str:
     for row in MAPPINGS:
         if row.use and not row.bags:
             types.setdefault(row.use, []).append(row.type.rpartition("/")[2])
-    words = {use: _USES.get(use) or ", ".join(names) for use, names in types.items()}
-    groups = [(", ".join(f"``{u}``" for u in g), w) for w, g in groupby(words, words.__getitem__)]
-    return ", ".join(f"{uses} ({meant})" for uses, meant in groups)
+    descriptions = {use: _USES.get(use) or ", ".join(names) for use, names in types.items()}
+    groups = [
+        (", ".join(f"``{u}``" for u in g), w)
+        for w, g in groupby(descriptions, descriptions.__getitem__)
+    ]
+    return ", ".join(f"{uses} ({description})" for uses, description in groups)
 
 
 LARGE: tuple[type[Event], ...] = tuple(
@@ -295,9 +298,9 @@ def publication(kind: TopicKind, source: str, config: PublishingConfig) -> Topic
     if sensor and above.endswith(f"/{last}"):  # /drone/imu, not /drone/imu/imu
         name = above
     full = topic_name(config.namespace, name)
-    given = config.topics.get(full, config.topics.get(name))
+    new_name = config.topics.get(full, config.topics.get(name))
     return Topic(
-        name=full if given is None else topic_name(config.namespace, given),
+        name=full if new_name is None else topic_name(config.namespace, new_name),
         type=row.type,
         qos=Qos(depth=5) if sensor and config.sensor_qos == "reliable" else row.qos,
     )
@@ -331,10 +334,10 @@ class Publisher(Protocol):
 
     @property
     def wanted(self) -> bool:
-        """Tell whether messages are to be made at all; large ones cost time."""
+        """Return whether messages are needed; large ones cost time."""
 
     def put(self, message: bytearray) -> None:
-        """Take a message as CDR, whose bytes may be overwritten afterwards."""
+        """Publish a message in CDR, whose bytes may be overwritten afterwards."""
 
 
 P = TypeVar("P", bound=Publisher)
@@ -342,7 +345,7 @@ P_co = TypeVar("P_co", bound=Publisher, covariant=True)
 
 
 class Sink(Protocol[P_co]):
-    """Where messages go."""
+    """Protocol of a transport, which declares publishers."""
 
     def publisher(self, topic: Topic) -> P_co:
         """Declare a topic."""
@@ -387,34 +390,34 @@ class Publishing(Generic[P]):
     def unannounced(self) -> Iterator[str]:
         """Yield a line for each setting with an unannounced name."""
         config = self._config
-        for setting, name, known, what in (
+        for setting, name, announced, kind in (
             ("vehicle", config.vehicle, self._vehicles, "a vehicle"),
             ("tf", "" if config.tf == "truth" else config.tf, self._estimators, "an estimator"),
         ):
-            if name and name not in known:
+            if name and name not in announced:
                 yield (
-                    f'{setting}: expected {what} that is announced, found "{name}" '
-                    f"(there are: {', '.join(known) or 'none'})"
+                    f'{setting}: expected {kind} that is announced, found "{name}" '
+                    f"(there are: {', '.join(announced) or 'none'})"
                 )
 
     def unused(self) -> Iterator[str]:
         """Yield a line for each new name in `topics` without a topic."""
         names = {publisher.topic.name for publisher in self.publishers}
-        for given, name in self._config.topics.items():
+        for old_name, name in self._config.topics.items():
             if topic_name(self._config.namespace, name) not in names:
-                yield f'topics: expected the name of a topic, found "{given}", which none has'
+                yield f'topics: expected the name of a topic, found "{old_name}", which none has'
 
     def begin(self) -> None:
-        """Put the fixed transforms, for the whole run."""
+        """Publish the fixed transforms, for the whole run."""
         if self._out.transforms.static():
             self._put("tf_static", "", outgoing.fixed_transforms, None)
 
     def clock(self, now: int) -> None:
-        """Put the time (ns)."""
+        """Publish the time (ns)."""
         self._put("clock", "", outgoing.clock, now)
 
     def put(self, event: Event) -> None:
-        """Put the messages of an event; for `LARGE` events in threads, a thread per type."""
+        """Publish the messages of an event; for `LARGE` events in threads, a thread per type."""
         if isinstance(event, TrackedFeatures):
             self.names.vehicles.tracked(event)
         if isinstance(event, TransformStamped) and self._out.transforms.add_static(event):
@@ -425,9 +428,9 @@ class Publishing(Generic[P]):
                 continue
             self._put(row.kind, source, row.write, event)
 
-    def _put(self, kind: TopicKind, source: str, write: Write, of: Any) -> None:
+    def _put(self, kind: TopicKind, source: str, write: Write, value: Any) -> None:
         if publisher := self._publisher(kind, source):
-            message = write(self._out, of)
+            message = write(self._out, value)
             if message is not None:
                 done = isinstance(message, bytearray)
                 publisher.put(message if done else self._store.serialize(message))
@@ -441,11 +444,11 @@ class Publishing(Generic[P]):
         return publisher if publisher is not None and publisher.wanted else None
 
     def _declare(self, kind: TopicKind, source: str) -> P | None:
-        with self._lock:  # two threads may want one for the first time together
+        with self._lock:  # two threads may declare one at the same time
             if (kind, source) not in self._publishers:
-                made, topic = None, publication(kind, source, self._config)
+                publisher, topic = None, publication(kind, source, self._config)
                 if topic is not None:
                     hashed = msgspec.structs.replace(topic, hash=self._store.hash(topic.type))
-                    made = self._sink.publisher(hashed)
-                self._publishers[kind, source] = made
+                    publisher = self._sink.publisher(hashed)
+                self._publishers[kind, source] = publisher
             return self._publishers[kind, source]

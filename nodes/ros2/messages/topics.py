@@ -153,16 +153,16 @@ class PublishingConfig(NodeConfig):
             raise ValueError(f"namespace: expected a leading slash, found {self.namespace!r}")
         if self.namespace != "/":
             check_name("namespace", self.namespace)
-        for given, name in self.topics.items():
-            check_name(f'topics: "{given}"', name)
+        for old_name, name in self.topics.items():
+            check_name(f'topics: "{old_name}"', name)
 
 
-def check_name(where: str, name: str) -> None:
-    """Raise a `ValueError`, beginning with `where`, for a name that ROS does not allow."""
+def check_name(place: str, name: str) -> None:
+    """Raise a `ValueError`, beginning with `place`, for a name that ROS does not allow."""
     try:
         topic_name("/", name)
     except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
+        raise ValueError(f"{place}: {error}") from None
 
 
 SIMULATION = "simulation_interfaces/srv"
@@ -218,7 +218,7 @@ class FrameNames:
         self.vehicles.announced(camera)
         if camera.frame_id not in self._cameras:
             name = ros_name(camera.source.rpartition("/")[2])
-            if any(known == name for _, known in self._cameras.values()):
+            if any(other_name == name for _, other_name in self._cameras.values()):
                 name = ros_name(camera.source).replace("/", "_")
             self._cameras[camera.frame_id] = (camera.source, name)
         frames = self.camera(camera.frame_id)
@@ -227,10 +227,10 @@ class FrameNames:
 
     def camera(self, frame_id: str) -> CameraFrames | None:
         """Return the frames of the camera with this optical frame, if any."""
-        known = self._cameras.get(frame_id)
-        if known is None:
+        entry = self._cameras.get(frame_id)
+        if entry is None:
             return None
-        source, name = known
+        source, name = entry
         prefix = ""
         if len(self.vehicles.names) > 1 and (vehicle := self.vehicles.carrier(source)):
             prefix, name = f"{ros_name(vehicle)}/", ros_name(source.rpartition("/")[2])
@@ -244,8 +244,8 @@ class FrameNames:
         if camera is not None:
             return camera.optical
         vehicle = self.vehicles.of(source)
-        own = frame_id.removeprefix(f"{vehicle}/")  # ``drone/lidar``, which names it already
-        return f"{ros_name(vehicle)}/{own}" if len(self.vehicles.names) > 1 else own
+        local_name = frame_id.removeprefix(f"{vehicle}/")  # ``drone/lidar``, which names it already
+        return f"{ros_name(vehicle)}/{local_name}" if len(self.vehicles.names) > 1 else local_name
 
     def axes(self, frame_id: str) -> Axes:
         """Return how a frame's axes lie."""

@@ -131,12 +131,12 @@ class Transforms:
         known = not self._starts or event.source in self._starts
         if not known and (self._only or event.child_frame_id == "base_link"):
             return []
-        if self._body != "truth" and self._of_body(event.source):
+        if self._body != "truth" and self._is_of_body(event.source):
             return []
         return self._place(event)
 
     def estimate(self, event: PoseEstimate) -> list[Transform]:
-        """Return where an estimate puts the body."""
+        """Return the body's transform by an estimate."""
         return self._place(event) if event.source == self._body else []
 
     def pose(self, event: PoseStamped) -> list[Transform]:
@@ -167,7 +167,7 @@ class Transforms:
             for source, frame in self._fixed
         )
 
-    def _of_body(self, source: str) -> bool:
+    def _is_of_body(self, source: str) -> bool:
         return self._names.vehicles.of(source) == self._names.vehicles.of(self._body)
 
     def _place(self, event: Odometry | PoseEstimate) -> list[Transform]:
@@ -181,10 +181,10 @@ class Transforms:
         return [self._turned(parent, child, pose, event.source)]
 
     def _turned(self, parent: str, child: str, pose: Pose, source: str) -> Transform:
-        to, of = self._names.axes(parent), self._names.axes(child)
-        rotation = convert_rotation(to, of, pose[1])
+        parent_axes, child_axes = self._names.axes(parent), self._names.axes(child)
+        rotation = convert_rotation(parent_axes, child_axes, pose[1])
         names = self._names.name(parent, source), self._names.name(child, source)
-        return Transform(*names, convert_vector(to, pose[0]), rotation)
+        return Transform(*names, convert_vector(parent_axes, pose[0]), rotation)
 
     def _link(self, parent: str, optical: str, pose: Pose, source: str) -> Transform:
         """Return a camera's body in its parent, from its optical frame's pose."""
@@ -253,33 +253,33 @@ class PathMessage:
         )
         self._rows = np.zeros(length, self._row)
         self._rows["size"], self._rows["name"] = len(name) + 1, name
-        self._kept = 0
+        self._count = 0
         self._last: Vector3 = (0.0, 0.0, 0.0)
         self._count_at = _CDR + _aligned(12 + len(name) + 1, 4)
 
     def far(self, position: Vector3) -> bool:
-        """Tell whether a pose here would be kept."""
-        return not self._kept or dist(position, self._last) >= self.step
+        """Return whether `add` is due: the pose is a step away from the last one."""
+        return not self._count or dist(position, self._last) >= self.step
 
     def add(self, time: Time, position: Vector3, orientation: Quaternion) -> None:
-        """Keep a pose, in ROS's axes, at a time (s, ns)."""
-        if self._kept == len(self._rows) - 1:  # the last is for the newest pose
-            half = self._rows[: self._kept : 2].copy()
+        """Add a pose, in ROS's axes, at a time (s, ns)."""
+        if self._count == len(self._rows) - 1:  # the last is for the newest pose
+            half = self._rows[: self._count : 2].copy()
             self._rows[: len(half)] = half
-            self._kept, self.step = len(half), 2.0 * self.step
-        self._put(self._kept, time, position, orientation)
-        self._kept, self._last = self._kept + 1, position
+            self._count, self.step = len(half), 2.0 * self.step
+        self._set_row(self._count, time, position, orientation)
+        self._count, self._last = self._count + 1, position
 
     def message(self, time: Time, position: Vector3, orientation: Quaternion) -> bytearray:
         """Return the path up to a pose, kept or not; arguments are as of `add`."""
-        self._put(self._kept, time, position, orientation)
-        count = self._kept + (self._kept == 0 or dist(position, self._last) > 0.0)
+        self._set_row(self._count, time, position, orientation)
+        count = self._count + (self._count == 0 or dist(position, self._last) > 0.0)
         data = self._first(time)
         _COUNT.pack_into(data, self._count_at, count)
         data += self._rows[1:count].tobytes()
         return data
 
-    def _put(self, index: int, time: Time, position: Vector3, orientation: Quaternion) -> None:
+    def _set_row(self, index: int, time: Time, position: Vector3, orientation: Quaternion) -> None:
         row, (w, x, y, z) = self._rows[index], orientation
         row["sec"], row["nanosec"] = time
         row["pose"] = (*position, x, y, z, w)

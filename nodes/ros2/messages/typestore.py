@@ -30,7 +30,7 @@ Distribution = Literal["humble", "iron", "jazzy", "kilted"]
 
 
 def _hash_as_ros_2_does() -> None:
-    """Have rosbags hash ``char`` as rosidl_adapter does, ``uint8``, lest keys meet nobody."""
+    """Make rosbags hash ``char`` as ``uint8``, as rosidl_adapter does: keys contain the hash."""
     from rosbags.typesys.store import TIDMAP
 
     TIDMAP["char"] = TIDMAP["uint8"]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from nodes.ros2.bridge.keys import Message
-from nodes.ros2.bridge.session import Take
+from nodes.ros2.bridge.session import MessageCallback
 from nodes.ros2.messages.topics import Topic
 from tests.nodes.ros2.messages import samples
 
@@ -54,7 +54,7 @@ class TakingSession:
         self.taken.append(Taken(topic))
         return self.taken[-1]
 
-    def subscribe(self, topic: Topic, take: Take, *, late: bool = False) -> None:
+    def subscribe(self, topic: Topic, take: MessageCallback, *, late: bool = False) -> None:
         for message in self.said:
             take(Message(len(message), functools.partial(bytes, message)))
 

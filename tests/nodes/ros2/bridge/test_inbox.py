@@ -43,7 +43,7 @@ class Box:
     def give(self, *data: bytes) -> None:
         for payload in data:
             self.clock.now += 1e-3
-            self.inbox.take(Message(len(payload), functools.partial(bytes, payload)))
+            self.inbox.receive(Message(len(payload), functools.partial(bytes, payload)))
 
 
 async def test_a_burst_wakes_the_loop_once_and_keeps_its_order() -> None:
@@ -81,7 +81,7 @@ async def test_a_flood_is_dropped_before_its_bytes_are_read() -> None:
 
     for _ in range(10_000):
         box.clock.now += 1e-4
-        box.inbox.take(Message(1, bytes_of_it))
+        box.inbox.receive(Message(1, bytes_of_it))
         if read % 5 == 0:
             await asyncio.sleep(0)
     assert 100 <= read <= 111  # a second's worth, and a burst
@@ -96,7 +96,7 @@ async def test_every_message_of_a_flood_is_delivered_or_counted() -> None:
     def flood() -> None:
         for number in range(2500):
             box.clock.now += 1e-4
-            box.inbox.take(Message(sizes[number % 4], lambda: b"x"))
+            box.inbox.receive(Message(sizes[number % 4], lambda: b"x"))
 
     async with asyncio.TaskGroup() as group:
         for _ in range(4):
@@ -109,7 +109,7 @@ async def test_every_message_of_a_flood_is_delivered_or_counted() -> None:
 
 async def test_what_is_too_large_is_not_read() -> None:
     box = Box()
-    box.inbox.take(Message(101, lambda: 1 / 0))  # type: ignore[arg-type,return-value]
+    box.inbox.receive(Message(101, lambda: 1 / 0))  # type: ignore[arg-type,return-value]
     assert box.said == {"message too large": 1}
 
 

@@ -65,10 +65,10 @@ def test_a_mapping_may_say_nothing() -> None:
 )
 def test_a_source_narrows_it(source: str, wanted: bool) -> None:
     outgoing, _, _ = made(source=source)
-    assert outgoing.wants(battery()) is wanted
+    assert outgoing.accepts(battery()) is wanted
     zero = (0.0, 0.0, 0.0)
     imu = Imu(stamp=0, source="drone/pack", angular_velocity=zero, linear_acceleration=zero)
-    assert not outgoing.wants(imu)
+    assert not outgoing.accepts(imu)
 
 
 @pytest.mark.parametrize(

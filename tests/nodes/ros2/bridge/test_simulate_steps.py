@@ -11,7 +11,7 @@ import pytest
 import zenoh
 
 from nodes.ros2.bridge.keys import Attachment, pack
-from nodes.ros2.bridge.services import KEPT
+from nodes.ros2.bridge.services import STORED_RESULTS
 from nodes.ros2.messages.topics import CANCEL_GOAL, DEFINITIONS, STEPS
 from nodes.ros2.messages.typestore import TypeStore
 from runtime.config.model import Config, NodeSpec, RunConfig
@@ -200,11 +200,11 @@ def test_what_cannot_be_done_is_aborted_and_says_why() -> None:
 def test_goals_are_forgotten_but_for_the_last() -> None:
     def drive(action: ActionClient) -> None:
         assert action.send(1, FOREVER)
-        for id_ in range(2, KEPT + 3):
+        for id_ in range(2, STORED_RESULTS + 3):
             assert action.send(id_, 1)
             assert action.result(id_)[0] == ABORTED
         assert action.result(2)[0] == 0
-        assert action.result(KEPT + 2)[0] == ABORTED
+        assert action.result(STORED_RESULTS + 2)[0] == ABORTED
         assert action.cancel(1) == (0, [1])  # which goes on, and is kept
         assert action.result(1)[0] == CANCELED
 
