@@ -41,7 +41,7 @@ class Program:
         links = self.endpoint._links
         (peer,) = (peer for peer in links.peers if peer.name == self.link)
         self._socket.sendto(data, peer.end.getsockname())
-        links.hear(peer)
+        links.read(peer)
 
     def hear(self) -> list[Any]:
         messages: list[Any] = []
@@ -87,7 +87,7 @@ class Outside(Program):
     def at(self, position: Any) -> None:
         """Put the vehicle somewhere, level."""
         still = (0.0, 0.0, 0.0)
-        self.endpoint.vehicle.note(
+        self.endpoint.vehicle.set_pose(
             Odometry(
                 stamp=self.now, source="drone", position=position, orientation=(1, 0, 0, 0),
                 linear_velocity=still, angular_velocity=still,

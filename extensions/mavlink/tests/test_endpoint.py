@@ -652,7 +652,7 @@ async def test_streams_of_rates_are_set(outside: Outside) -> None:
 def sampled(vehicle: Any, stamp: int) -> None:
     """Let an IMU measure that is turned upside down about the body's x."""
     vehicle.imu_orientation = (0.0, 1.0, 0.0, 0.0)
-    vehicle.measure(
+    vehicle.add_sample(
         ev.Imu(
             stamp=stamp, source="drone/imu", angular_velocity=(0.1, 0.2, 0.3),
             linear_acceleration=(1.0, 2.0, 9.8),
@@ -666,7 +666,7 @@ async def test_samples_of_the_imu_come_in_the_axes_of_the_body(outside: Outside)
     field = ev.MagneticField(stamp=1, source="drone/magnetometer", magnetic_field=(2e-5, 0.0, 4e-5))
     pressure = ev.FluidPressure(stamp=1, source="drone/barometer", fluid_pressure=101325.0)
     sampled(vehicle, 5_000_000)
-    vehicle.measure(field)
+    vehicle.add_sample(field)
     (imu,) = of("HIGHRES_IMU", outside.passes(0.04))
     assert (imu.time_usec, imu.temperature) == (5000, 0.0)
     assert (imu.xacc, imu.yacc, imu.zacc) == pytest.approx((1.0, -2.0, -9.8))
@@ -674,7 +674,7 @@ async def test_samples_of_the_imu_come_in_the_axes_of_the_body(outside: Outside)
     assert (imu.xmag, imu.ymag, imu.zmag) == pytest.approx((0.2, 0.0, 0.4))
     assert imu.fields_updated == 0b111111111
     assert of("HIGHRES_IMU", outside.passes(0.2)) == []  # nothing new
-    vehicle.measure(pressure)
+    vehicle.add_sample(pressure)
     sampled(vehicle, 9_000_000)
     (imu,) = of("HIGHRES_IMU", outside.passes(0.1))
     assert imu.fields_updated == 0b101000111111
@@ -697,7 +697,7 @@ async def test_what_is_new_is_so_for_each_program() -> None:
     for step in range(60):
         if step == 25:
             source = "drone/magnetometer"
-            vehicle.measure(ev.MagneticField(stamp=1, source=source, magnetic_field=(1.0, 0, 0)))
+            vehicle.add_sample(ev.MagneticField(stamp=1, source=source, magnetic_field=(1.0, 0, 0)))
         sampled(vehicle, step)
         flags += [message.fields_updated for message in of("HIGHRES_IMU", outside.passes(0.01))]
     assert [flag > 0b111111 for flag in flags] == [step == 25 for step in range(60)]

@@ -69,7 +69,7 @@ def land_here(seq: int) -> Any:
 def touch_down(outside: Outside) -> tuple[list[int], list[str]]:
     """Let the vehicle land; return what is reached then, and what is told."""
     outside.hear()
-    outside.endpoint.flight.noted(ev.Landed(stamp=outside.now, source="drone"))
+    outside.endpoint.flight.handle_event(ev.Landed(stamp=outside.now, source="drone"))
     messages = outside.hear()
     return [message.seq for message in of("MISSION_ITEM_REACHED", messages)], texts(messages)
 
@@ -320,7 +320,7 @@ async def test_a_landing_that_ends_in_the_air_is_not_reached(outside: Outside, e
     elif ends == "jump":
         outside.say(mav.MAVLink_mission_set_current_message(1, 1, 0))
     else:
-        outside.endpoint.flight.noted(ev.Disarmed(stamp=outside.now, source="drone"))
+        outside.endpoint.flight.handle_event(ev.Disarmed(stamp=outside.now, source="drone"))
     assert touch_down(outside) == ([], [])
 
 

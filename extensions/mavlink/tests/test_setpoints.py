@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import common as mav
 import events as ev
 from events import Odometry
 from events.frames import from_rpy, from_yaw, yaw_of
-from visnav_mavlink.setpoints import FASTEST, PLACE_GAIN, Made, Offboard
+from visnav_mavlink.setpoints import FASTEST, PLACE_GAIN, ConvertedSetpoint, Offboard
 from visnav_mavlink.vehicle import SECOND, Vehicle
 
 ORIGIN = (47.0, 8.0, 400.0)
@@ -35,7 +35,7 @@ def vehicle(position: Any = HERE, yaw: float = 0.0) -> Vehicle:
 
 def move(vehicle: Vehicle, position: Any, yaw: float = 0.0) -> None:
     still = (0.0, 0.0, 0.0)
-    vehicle.note(
+    vehicle.set_pose(
         Odometry(
             stamp=0, source="drone", position=position, orientation=from_yaw(yaw),
             linear_velocity=still, angular_velocity=still,
@@ -51,8 +51,8 @@ def local(ignored: str = "", frame: int = 1, mask: int = 0, **changes: float) ->
     )
 
 
-def made(message: Any) -> Made:
-    result = Offboard(vehicle()).take(message, 0)
+def made(message: Any) -> ConvertedSetpoint:
+    result = Offboard(vehicle()).accept(message, 0)
     result.kind(stamp=0, source="mavlink", **result.fields)  # a valid event
     return result
 
@@ -102,27 +102,27 @@ def test_a_height_is_held_at_a_velocity_step_after_step() -> None:
     """The set-point is made again from where the vehicle is."""
     drone = vehicle()
     offboard = Offboard(drone)
-    assert offboard.take(local("x y vz afx afy afz yaw yaw_rate", vx=1.0), 0).depends
+    assert offboard.accept(local("x y vz afx afy afz yaw yaw_rate", vx=1.0), 0).depends
     x, y, z = HERE
     for step in range(500):
-        again = offboard.again(step * SECOND // 100)
-        assert again is not None
-        vx, vy, vz = again.fields["velocity"]
+        renew = offboard.renew(step * SECOND // 100)
+        assert renew is not None
+        vx, vy, vz = renew.fields["velocity"]
         x, y, z = x + 0.01 * vx, y + 0.01 * vy, z + 0.01 * vz
         move(drone, (x, y, z))
     assert (x, y, z) == pytest.approx((HERE[0] + 5.0, HERE[1] + 1.0, ALL["z"]), abs=0.01)
-    offboard.take(local("x y z afx afy afz yaw yaw_rate"), 0)
-    assert offboard.again(1) is None  # a velocity alone stays as it is
+    offboard.accept(local("x y z afx afy afz yaw yaw_rate"), 0)
+    assert offboard.renew(1) is None  # a velocity alone stays as it is
 
 
 def test_a_heading_beside_a_velocity_is_turned_to() -> None:
     drone = vehicle(yaw=3.0)
     offboard, yaw = Offboard(drone), 3.0
-    offboard.take(local("x y z afx afy afz yaw_rate", yaw=-3.0), 0)
+    offboard.accept(local("x y z afx afy afz yaw_rate", yaw=-3.0), 0)
     for step in range(500):
-        again = offboard.again(step * SECOND // 100)
-        assert again is not None
-        yaw += 0.01 * again.fields["yaw_rate"]
+        renew = offboard.renew(step * SECOND // 100)
+        assert renew is not None
+        yaw += 0.01 * renew.fields["yaw_rate"]
         move(drone, HERE, yaw)
     assert math.remainder(yaw + 3.0, math.tau) == pytest.approx(0.0, abs=0.01)
 
@@ -142,7 +142,7 @@ def test_a_heading_beside_a_velocity_is_turned_to() -> None:
 )
 def test_what_cannot_be_followed_says_why(message: Any, words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        Offboard(vehicle()).take(message, 0)
+        Offboard(vehicle()).accept(message, 0)
 
 
 def test_a_place_in_another_country_says_how_far_it_is() -> None:
@@ -180,7 +180,7 @@ def test_each_bit_of_a_global_target_alone(name: str) -> None:
     message = mav.MAVLink_set_position_target_global_int_message(
         0, 1, 1, mav.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT, 1 << BITS[name], *values
     )
-    result, same = Offboard(drone).take(message, 0), made(local(name))
+    result, same = Offboard(drone).accept(message, 0), made(local(name))
     assert result.kind is same.kind
     for field, value in same.fields.items():
         assert result.fields[field] == pytest.approx(value, abs=0.03), field
@@ -217,22 +217,22 @@ def test_each_bit_of_the_rates_alone(bit: int, nan: bool) -> None:
 )
 def test_an_attitude_that_cannot_be_followed_says_why(message: Any, words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        Offboard(vehicle()).take(message, 0)
+        Offboard(vehicle()).accept(message, 0)
 
 
 def test_an_attitude_turns_on_at_the_yaw_rate_beside_it() -> None:
     """From its own heading, whether it comes again or not; without a rate its heading counts."""
     offboard = Offboard(vehicle())
     turn = from_rpy(0.1, 0.2, 1.0)
-    first = offboard.take(attitude(3, turn, (0, 0, 0.5)), 0)
+    first = offboard.accept(attitude(3, turn, (0, 0, 0.5)), 0)
     assert first.fields["orientation"] == pytest.approx(turn)
-    offboard.again(SECOND // 2)
-    offboard.take(attitude(3, turn, (0, 0, 0.5)), SECOND)
-    later = offboard.again(2 * SECOND)
+    offboard.renew(SECOND // 2)
+    offboard.accept(attitude(3, turn, (0, 0, 0.5)), SECOND)
+    later = offboard.renew(2 * SECOND)
     assert later is not None
     assert later.fields["orientation"] == pytest.approx(from_rpy(0.1, 0.2, 2.0), abs=1e-6)
     for message in (attitude(7, turn), attitude(0, turn, (0, 0, 0))):
-        still = offboard.take(message, 3 * SECOND)
+        still = offboard.accept(message, 3 * SECOND)
         assert yaw_of(still.fields["orientation"]) == pytest.approx(1.0)
         assert not still.depends
     assert made(attitude(0)).dropped == "roll and pitch rates beside an attitude"

@@ -27,12 +27,12 @@ class Clock:
     """A program's clock.
 
     Attributes:
-        way: What its stamps are corrected by; empty before the first.
+        method: Source of the correction of its stamps; empty before the first.
         correction: What is added to its stamps, ns.
         offset: Ours less its own by ``TIMESYNC``, ns, whose answer took `round_trip`.
     """
 
-    way: Literal["", "nothing", "TIMESYNC", "the earliest arrival"] = ""
+    method: Literal["", "nothing", "TIMESYNC", "the earliest arrival"] = ""
     correction: int = 0
     offset: int = 0
     round_trip: int | None = None
@@ -42,27 +42,27 @@ class Clocks:
     """All programs' clocks.
 
     Args:
-        delay: Of poses behind their corrected stamps, ns, which is told with the correction.
+        delay: Of poses behind their corrected stamps, ns, which is reported with the correction.
         send: Sends a message to all programs.
-        tell: Says a sentence, the first time, to all programs and to the log.
+        report_once: Sends a sentence, the first time, to all programs and to the log.
     """
 
     def __init__(
-        self, delay: int, send: Callable[[Any], None], tell: Callable[[str], None]
+        self, delay: int, send: Callable[[Any], None], report_once: Callable[[str], None]
     ) -> None:
-        self.delay, self._send, self._tell = delay, send, tell
+        self.delay, self._send, self._report_once = delay, send, report_once
         self._clocks: dict[Sender, Clock] = {}
         self._due = 0
 
     def update(self, now: int) -> None:
-        """Ask for all clocks, now and then."""
+        """Request the time of all clocks, once a period."""
         if now >= self._due:
             self._due = now + PERIOD
             self._send(mav.MAVLink_timesync_message(0, now))
 
-    def hear(self, sender: Sender, answer: Any, now: int) -> None:
-        """Take a quick answer to a request; the newest, for clocks drift if a run falls behind."""
-        round_trip, clock = now - answer.ts1, self._of(sender)
+    def handle(self, sender: Sender, answer: Any, now: int) -> None:
+        """Store the offset of a quick answer; the newest, as clocks drift if a run falls behind."""
+        round_trip, clock = now - answer.ts1, self._clock_of(sender)
         longest = SECOND if clock.round_trip is None else max(2 * clock.round_trip, QUICK)
         if answer.tc1 and 0 <= round_trip <= longest:
             clock.offset = answer.ts1 + round_trip // 2 - answer.tc1
@@ -70,37 +70,37 @@ class Clocks:
 
     def stamp(self, sender: Sender, stamp: int, now: int) -> int:
         """Return a stamp of a sender's (ns) in our clock, at its arrival, without the delay."""
-        age, clock = now - stamp, self._of(sender)
-        if clock.way == "the earliest arrival":
+        age, clock = now - stamp, self._clock_of(sender)
+        if clock.method == "the earliest arrival":
             clock.correction = min(clock.correction, age)
-        elif clock.way == "TIMESYNC":
+        elif clock.method == "TIMESYNC":
             clock.correction = clock.offset
         if (
-            not clock.way
-            or (clock.way == "the earliest arrival" and clock.round_trip is not None)
+            not clock.method
+            or (clock.method == "the earliest arrival" and clock.round_trip is not None)
             or not EARLIEST <= age - clock.correction < OLDEST
         ):
             self._decide(sender, clock, age)
         return min(stamp + clock.correction, now)
 
     def _decide(self, sender: Sender, clock: Clock, age: int) -> None:
-        before = clock.way
-        clock.way, clock.correction = "the earliest arrival", age
+        before = clock.method
+        clock.method, clock.correction = "the earliest arrival", age
         youngest = LATEST
         if EARLIEST <= age < youngest:
-            clock.way, clock.correction, youngest = "nothing", 0, age
+            clock.method, clock.correction, youngest = "nothing", 0, age
         if clock.round_trip is not None and EARLIEST <= age - clock.offset < youngest:
-            clock.way, clock.correction = "TIMESYNC", clock.offset
-        if clock.correction and clock.way != before:
+            clock.method, clock.correction = "TIMESYNC", clock.offset
+        if clock.correction and clock.method != before:
             system, component = sender
             off = abs(clock.correction) / SECOND
-            where = "behind" if clock.correction > 0 else "ahead"
-            self._tell(
-                f"poses of {system}/{component}: stamps are {off:.1f} s {where}, of another clock: "
-                f"corrected by {clock.way}; delay {self.delay / 1e6:g} ms"
+            sign = "behind" if clock.correction > 0 else "ahead"
+            self._report_once(
+                f"poses of {system}/{component}: stamps are {off:.1f} s {sign}, of another clock: "
+                f"corrected by {clock.method}; delay {self.delay / 1e6:g} ms"
             )
 
-    def _of(self, sender: Sender) -> Clock:
+    def _clock_of(self, sender: Sender) -> Clock:
         if sender not in self._clocks and len(self._clocks) >= MOST_CLOCKS:
             self._clocks.clear()
         return self._clocks.setdefault(sender, Clock())

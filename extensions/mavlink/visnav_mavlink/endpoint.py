@@ -28,7 +28,7 @@ class MavlinkEndpoint:
 
     Args:
         act: Sends a command or a set-point of these fields to the vehicle.
-        see: Publishes a pose from outside: its stamp and fields.
+        publish_pose: Publishes a pose from outside: its stamp and fields.
     """
 
     def __init__(
@@ -36,35 +36,35 @@ class MavlinkEndpoint:
         config: MavlinkConfig,
         origin: Geodetic,
         act: Callable[..., None],
-        see: Callable[..., None],
+        publish_pose: Callable[..., None],
         now: Callable[[], int],
         log: NodeLogger,
     ) -> None:
         self._config, self._now, self._log = config, now, log
         self._sentences: set[str] = set()
         self._text_number = 0
-        self._is_lost = True  # until the first is heard
+        self._is_lost = True  # until the first message
         ids = config.system_id, int(mav.MAV_COMP_ID_AUTOPILOT1)
-        self._links = Links(ids, bytes.fromhex(config.signing_key), self._hear, log)
+        self._links = Links(ids, bytes.fromhex(config.signing_key), self._handle, log)
         self._send = send = self._links.send
         self.vehicle = vehicle = Vehicle(origin, config.gps, config.autopilot == "ardupilot")
-        self._clocks = Clocks(round(config.delay * SECOND), send, self._tell_once)
-        self._vision = Vision(self._clocks, see, self._refuse, self._tell_once)
-        self._telemetry = Telemetry(vehicle, self._links, self._tell)
-        self._parameters = Parameters(send, self._tell)
+        self._clocks = Clocks(round(config.delay * SECOND), send, self._report_once)
+        self._vision = Vision(self._clocks, publish_pose, self._refuse, self._report_once)
+        self._telemetry = Telemetry(vehicle, self._links, self._report)
+        self._parameters = Parameters(send, self._report)
         self._missions = Missions(
             vehicle,
             send,
-            lambda item: self.flight.why_not(item),
-            self._tell,
+            lambda item: self.flight.refusal(item),
+            self._report,
             lambda: self.flight.drop_item(),
-            Guided(vehicle, lambda item, now: self.flight.go_to(item, now))
+            Guided(vehicle, lambda item, now: self.flight.fly_to(item, now))
             if vehicle.is_copter
             else None,
         )
         vehicle.progress = lambda: self._missions.progress
         parts = self._missions, self._parameters
-        self.flight = Flight(vehicle, *parts, act, self._tell, self._once)
+        self.flight = Flight(vehicle, *parts, act, self._report, self._warn_once)
         by_handler: dict[Handler, str] = {
             self._command: "COMMAND_LONG COMMAND_INT",
             self._set_mode: "SET_MODE",
@@ -77,8 +77,9 @@ class MavlinkEndpoint:
             self._parameter: "PARAM_REQUEST_LIST PARAM_REQUEST_READ PARAM_SET",
             self._set_rates: "REQUEST_DATA_STREAM",
             self._timesync: "TIMESYNC",
-            self._see: "ODOMETRY VISION_POSITION_ESTIMATE VICON_POSITION_ESTIMATE ATT_POS_MOCAP "
-            "GLOBAL_VISION_POSITION_ESTIMATE VISION_SPEED_ESTIMATE VISION_POSITION_DELTA",
+            self._handle_pose: "ODOMETRY VISION_POSITION_ESTIMATE VICON_POSITION_ESTIMATE "
+            "ATT_POS_MOCAP GLOBAL_VISION_POSITION_ESTIMATE VISION_SPEED_ESTIMATE "
+            "VISION_POSITION_DELTA",
         }
         self._handlers = {
             kind: handle for handle, kinds in by_handler.items() for kind in kinds.split()
@@ -98,7 +99,7 @@ class MavlinkEndpoint:
         log("system %d on %s", self._config.system_id, ", ".join(self._config.endpoints))
 
     def update(self, now: int, wall: float) -> None:
-        """Send what is due, steer, and miss who is not heard; `wall` is in real seconds."""
+        """Send due messages, steer, and react to a lost link; `wall` is in real seconds."""
         config = self._config
         self._links.refill(wall)
         self._telemetry.update(now)
@@ -113,7 +114,7 @@ class MavlinkEndpoint:
         self._is_lost = is_lost
 
     def finish(self) -> str:
-        """Publish the last pose from outside; tell all programs, and return, how many there were.
+        """Publish the last pose from outside; report and return how many there were.
 
         Returns:
             Sentence; empty without `vision`.
@@ -121,7 +122,7 @@ class MavlinkEndpoint:
         if not self._config.vision:
             return ""
         text = self._vision.summary()
-        self._say(text, mav.MAV_SEVERITY_INFO)
+        self._send_text(text, mav.MAV_SEVERITY_INFO)
         (self._log.warning if self._vision.refused else self._log.info)("%s", text)
         return text
 
@@ -129,8 +130,8 @@ class MavlinkEndpoint:
         """Close the links."""
         self._links.close()
 
-    def _hear(self, peer: Peer, sender: Sender, message: Any) -> None:
-        """Treat a message as the table of messages has it."""
+    def _handle(self, peer: Peer, sender: Sender, message: Any) -> None:
+        """Handle a message by its row in the table of messages."""
         target = getattr(message, "target_system", getattr(message, "target", 0))
         part = getattr(message, "target_component", 0)
         if target not in {0, self._config.system_id} or part not in {0, 1}:
@@ -145,7 +146,9 @@ class MavlinkEndpoint:
             self._refuse(kind, sender, row.words)
         elif is_vehicle and row.treatment == "judged":
             self._vision.refused["another vehicle"] += self._config.vision
-            self._once("{} of system {}, component {} is another vehicle's".format(kind, *sender))
+            self._warn_once(
+                "{} of system {}, component {} is another vehicle's".format(kind, *sender)
+            )
         elif kind in self._handlers:
             self._handlers[kind](peer, sender, message, now)
         if answer := kind in ANSWERS and ANSWERS[kind](message, sender, now, self.vehicle):
@@ -164,16 +167,16 @@ class MavlinkEndpoint:
             self._refuse(message.get_type(), sender, str(error))
 
     def _sticks(self, _: Peer, sender: Sender, message: Any, now: int) -> None:  # noqa: ARG002
-        if words := self.flight.move_sticks(message):
-            self._refuse(message.get_type(), sender, words)
+        if reason := self.flight.move_sticks(message):
+            self._refuse(message.get_type(), sender, reason)
 
     def _mission(self, _: Peer, sender: Sender, message: Any, now: int) -> None:
-        if words := self._missions.hear(sender, message, now):
-            self._refuse(message.get_type(), sender, words)
+        if reason := self._missions.handle(sender, message, now):
+            self._refuse(message.get_type(), sender, reason)
 
     def _parameter(self, _: Peer, sender: Sender, message: Any, now: int) -> None:  # noqa: ARG002
-        if (words := self._parameters.hear(message, sender)) is not None:
-            self._refuse(message.get_type(), sender, words)
+        if (warning := self._parameters.handle(message, sender)) is not None:
+            self._refuse(message.get_type(), sender, warning)
 
     def _set_mode(self, _: Peer, sender: Sender, message: Any, now: int) -> None:
         mode = message.custom_mode
@@ -181,16 +184,16 @@ class MavlinkEndpoint:
             self._refuse("SET_MODE", sender, f"custom_mode {mode:#x} is not supported")
 
     def _timesync(self, _: Peer, sender: Sender, message: Any, now: int) -> None:
-        self._clocks.hear(sender, message, now)
+        self._clocks.handle(sender, message, now)
 
     def _set_rates(self, peer: Peer, sender: Sender, message: Any, _: int) -> None:
         rate = message.req_message_rate if message.start_stop else 0
         if not self._telemetry.set_stream(peer, message.req_stream_id, rate):
-            words = f"stream {message.req_stream_id} has no messages here"
-            self._refuse("REQUEST_DATA_STREAM", sender, words)
+            reason = f"stream {message.req_stream_id} has no messages here"
+            self._refuse("REQUEST_DATA_STREAM", sender, reason)
 
-    def _see(self, peer: Peer, sender: Sender, message: Any, now: int) -> None:
-        """Take a pose from outside as an estimate."""
+    def _handle_pose(self, peer: Peer, sender: Sender, message: Any, now: int) -> None:
+        """Publish a pose from outside as an estimate."""
         kind = message.get_type()
         if not self._config.vision:
             self._refuse(OF_ARDUPILOT.get(kind, kind), sender, "vision is false")
@@ -198,33 +201,33 @@ class MavlinkEndpoint:
         if kind in OF_ARDUPILOT and (message := peer.read_ardupilot(message)) is None:
             self._links.counts["pieces of garbage"] += 1
             return
-        self._vision.hear(sender, message, now)
+        self._vision.handle(sender, message, now)
 
-    def _refuse(self, kind: str, sender: Sender, words: str) -> None:
-        """Tell why messages have no effect, once for each kind, sender and reason."""
-        self._tell_once("{} of {}/{} has no effect: {}".format(kind, *sender, words))
+    def _refuse(self, kind: str, sender: Sender, reason: str) -> None:
+        """Report why messages have no effect, once for each kind, sender and reason."""
+        self._report_once("{} of {}/{} has no effect: {}".format(kind, *sender, reason))
 
-    def _tell_once(self, text: str) -> None:
+    def _report_once(self, text: str) -> None:
         if self._is_new(text):
-            self._tell(text)
+            self._report(text)
 
-    def _is_new(self, words: str) -> bool:
-        if words in self._sentences or len(self._sentences) >= MOST_SAID:
+    def _is_new(self, text: str) -> bool:
+        if text in self._sentences or len(self._sentences) >= MOST_SAID:
             return False
-        self._sentences.add(words)
+        self._sentences.add(text)
         return True
 
-    def _once(self, words: str) -> None:
-        if self._is_new(words):
-            self._log.warning("%s", words)
+    def _warn_once(self, text: str) -> None:
+        if self._is_new(text):
+            self._log.warning("%s", text)
 
-    def _tell(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         self._log.warning("%s", text)
-        self._say(text, mav.MAV_SEVERITY_WARNING)
+        self._send_text(text, mav.MAV_SEVERITY_WARNING)
 
-    def _say(self, text: str, level: int) -> None:
+    def _send_text(self, text: str, level: int) -> None:
         data = text.encode("ascii", "replace")
-        parts = [data[begin : begin + 50] for begin in range(0, len(data), 50)]
+        parts = [data[start : start + 50] for start in range(0, len(data), 50)]
         self._text_number = self._text_number % 65535 + 1
         number = self._text_number if len(parts) > 1 else 0
         for index, part in enumerate(parts):

@@ -1,4 +1,4 @@
-"""Modes, commands and offboard set-points: from messages to what a vehicle is told."""
+"""Modes, commands and offboard set-points: from messages to a vehicle's set-points."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ _UNKNOWN_PLACE = 2**31 - 1  # of an integer coordinate, as NaN is of a number
 
 
 class Flight:
-    """Flies a vehicle as MAVLink's programs ask it to.
+    """Flies a vehicle by the requests of MAVLink's programs.
 
     Args:
         act: Sends a command or a set-point of these fields to the vehicle.
-        tell: Says a sentence to all programs, by ``STATUSTEXT``, and to the log.
-        once: Says a sentence to the log, the first time.
+        report: Sends a sentence to all programs, by ``STATUSTEXT``, and to the log.
+        warn_once: Writes a sentence to the log, the first time.
     """
 
     def __init__(
@@ -57,15 +57,15 @@ class Flight:
         missions: Missions,
         parameters: Parameters,
         act: Callable[..., None],
-        tell: Callable[[str], None],
-        once: Callable[[str], None],
+        report: Callable[[str], None],
+        warn_once: Callable[[str], None],
     ) -> None:
         self._vehicle, self._missions, self._parameters = vehicle, missions, parameters
-        self._act, self._tell, self._once = act, tell, once
+        self._act, self._report, self._warn_once = act, report, warn_once
         self._goal: tuple[Vector3, float] | None = None  # place and heading
         self._carrot: Vector3 = (0.0, 0.0, 0.0)  # goes there at the cruising speed
         self._speed: float | None = None
-        self._lands_there = False
+        self._lands_at_goal = False
         self._followed: int | None = None  # stamp of the carrot's last step
         self._wait_until: int | None = None  # of a mission's item: once its place is reached
         self._offboard = Offboard(vehicle)
@@ -84,32 +84,32 @@ class Flight:
     def command(self, message: Any, now: int) -> int:
         """Carry out a ``COMMAND_LONG`` or ``COMMAND_INT``; return its ``MAV_RESULT``."""
         number = message.command
-        if (do := self._commands.get(number)) is None:
-            self._once(f"command {number} is not supported")
+        if (handler := self._commands.get(number)) is None:
+            self._warn_once(f"command {number} is not supported")
             return int(_UNKNOWN)
-        return int(do(message, now))
+        return int(handler(message, now))
 
     def set_mode(self, mode: str, now: int, climb: float = math.nan, resumes: bool = True) -> int:
-        """Go over to a mode; return a ``MAV_RESULT``.
+        """Change to a mode; return a ``MAV_RESULT``.
 
         Args:
             climb: Metres of a take-off; those of the parameter if NaN.
-            resumes: Whether a mission goes on, or from its first item after its last.
+            resumes: Whether a mission continues, or from its first item after its last.
         """
         vehicle = self._vehicle
         if mode == "offboard" and now - self._offboard.stamp > OFFBOARD_TIMEOUT:
-            self._tell("offboard: expected set-points before, found none of the last 0.5 s")
+            self._report("offboard: expected set-points before, found none of the last 0.5 s")
             return int(_LATER)
         if mode == "mission" and not self._missions.items:
-            self._tell("mission: expected one, found none: upload it first")
+            self._report("mission: expected one, found none: upload it first")
             return int(_LATER)
         if mode in {"takeoff", "return"} and not vehicle.armed:
-            self._tell(f"{mode} denied: expected an armed vehicle, found it disarmed")
+            self._report(f"{mode} denied: expected an armed vehicle, found it disarmed")
             return int(_LATER)
         flies = self._flies
         if mode == "takeoff" and (flies or vehicle.mode == "land"):
             doing = "landing" if vehicle.mode == "land" else "in the air"
-            self._tell(f"takeoff denied: expected a vehicle on the ground, found it {doing}")
+            self._report(f"takeoff denied: expected a vehicle on the ground, found it {doing}")
             return int(_LATER)
         if mode == "mission" and resumes:
             self._missions.resume()
@@ -127,12 +127,12 @@ class Flight:
         elif mode == "return" and vehicle.home is not None and flies:
             x, y, z = vehicle.home
             high = min(vehicle.position[2], z - self._parameters["RTL_RETURN_ALT"])
-            self._go((x, y, high))
-            self._lands_there = True
+            self._set_goal((x, y, high))
+            self._lands_at_goal = True
         return int(_OK)
 
     def set_custom_mode(self, number: int, now: int) -> int:
-        """Go over to a mode by a ``custom_mode``; return a ``MAV_RESULT``."""
+        """Change to a mode by a ``custom_mode``; return a ``MAV_RESULT``."""
         if self._vehicle.is_copter:
             return self._set_copter_mode(number, now)
         return self._set_px4_mode(number >> 16 & 255, number >> 24 & 255, now)
@@ -146,20 +146,20 @@ class Flight:
         for mode, numbers in MODES.items():
             if numbers == (main, sub):
                 return self.set_mode(mode, now)
-        self._once(f"mode {main:g}, {sub:g} is not supported")
+        self._warn_once(f"mode {main:g}, {sub:g} is not supported")
         return int(_UNKNOWN)
 
     def _set_copter_mode(self, number: float, now: int) -> int:
         if number == COPTER_MODES[self._vehicle.mode]:
             return int(_OK)
-        for mode, other in COPTER_MODES.items():
-            if other == number:
+        for mode, copter_number in COPTER_MODES.items():
+            if copter_number == number:
                 return self.set_mode(mode, now)
-        self._once(f"mode {number:g} of Copter is not supported")
+        self._warn_once(f"mode {number:g} of Copter is not supported")
         return int(_UNKNOWN)
 
-    def noted(self, event: ev.VehicleEvent) -> None:
-        """Take note of an event of the vehicle."""
+    def handle_event(self, event: ev.VehicleEvent) -> None:
+        """Update armed state, mode and mission by an event of the vehicle."""
         vehicle = self._vehicle
         if isinstance(event, ev.Armed):
             vehicle.armed = True
@@ -169,23 +169,23 @@ class Flight:
                 vehicle.mode = "hold"
             if self._missions.landing and isinstance(event, ev.Landed):
                 self._missions.reached()
-                self._tell_end()
+                self._report_end()
             self._missions.landing = False
         elif isinstance(event, ev.TakenOff) and vehicle.mode == "takeoff":
             vehicle.mode = "hold"
 
     def offboard(self, message: Any, now: int) -> None:
-        """Take a set-point of position, velocity, attitude or rates; sent on in offboard mode.
+        """Handle a set-point of position, velocity, attitude or rates; sent in offboard mode.
 
         A `ValueError` says why it cannot be followed.
         """
-        made = self._offboard.take(message, now)
-        if made.dropped:
-            self._once(f"{message.get_type()}: {made.dropped} are not followed")
+        setpoint = self._offboard.accept(message, now)
+        if setpoint.dropped:
+            self._warn_once(f"{message.get_type()}: {setpoint.dropped} are not followed")
         if self._vehicle.is_copter and self._vehicle.mode == "hold" and self._flies:
             self.set_mode("offboard", now)
         if self._vehicle.mode == "offboard":
-            self._act(made.kind, **made.fields)
+            self._act(setpoint.kind, **setpoint.fields)
 
     def move_sticks(self, message: Any) -> str:
         """Fly by a ``MANUAL_CONTROL``; return why it has no effect, if so."""
@@ -204,29 +204,29 @@ class Flight:
         return ""
 
     def update(self, now: int) -> None:
-        """Go on with what is under way."""
+        """Send the next set-points of the offboard program, the mission or the goal."""
         vehicle = self._vehicle
         if vehicle.mode == "offboard":
-            self._go_on_with_setpoint(now)
+            self._update_offboard(now)
         if vehicle.mode == "mission":
-            self._go_on_with_mission(now)
+            self._update_mission(now)
         if self._goal is not None and vehicle.armed:
             self._follow(now)
 
-    def _go_on_with_setpoint(self, now: int) -> None:
+    def _update_offboard(self, now: int) -> None:
         """Hold when set-points end; Copter's end later, and its places stay."""
         is_copter = self._vehicle.is_copter
-        made = self._offboard.again(now, all_of_them=is_copter)
-        stays = is_copter and made is not None and made.kind is ev.PositionSetpoint
+        setpoint = self._offboard.renew(now, all_of_them=is_copter)
+        stays = is_copter and setpoint is not None and setpoint.kind is ev.PositionSetpoint
         timeout = COPTER_TIMEOUT if is_copter else OFFBOARD_TIMEOUT
         if now - self._offboard.stamp > timeout and not stays:
-            self._tell(f"offboard: no set-point for {timeout / SECOND:g} s: holding")
+            self._report(f"offboard: no set-point for {timeout / SECOND:g} s: holding")
             self.set_mode("hold", now)
-        elif made is not None:
-            self._act(made.kind, **made.fields)
+        elif setpoint is not None:
+            self._act(setpoint.kind, **setpoint.fields)
 
-    def go_to(self, item: Item, now: int) -> str:
-        """Go to an item's place at once; return why not."""
+    def fly_to(self, item: Item, now: int) -> str:
+        """Fly to an item's place at once; return the reason if that is impossible."""
         if not self._flies:
             return "expected a vehicle in the air"
         try:
@@ -234,34 +234,31 @@ class Flight:
         except ValueError as error:
             return str(error)
         self.set_mode("hold", now)
-        self._go(place)
+        self._set_goal(place)
         return ""
 
     def drop_item(self) -> None:
-        """Give up a mission's item under way: another one is to be flown."""
+        """Cancel a mission's item under way, as another one follows."""
         if self._vehicle.mode == "mission":
             self._drop_goal()
 
     def _drop_goal(self) -> None:
-        self._goal, self._lands_there, self._wait_until = None, False, None
+        self._goal, self._lands_at_goal, self._wait_until = None, False, None
         self._missions.landing = False
 
     def lost(self, action: str, now: int) -> None:
-        """Do what is to be done without any program in the air: ``hold`` or ``land``.
-
-        A return or a landing goes on.
-        """
-        if self._lands_there:
+        """Hold or land in the air, as no program is connected; a return or a landing continues."""
+        if self._lands_at_goal:
             return
         if self._vehicle.landed_state == mav.MAV_LANDED_STATE_IN_AIR:
-            self._tell(f"no program is heard any more: {action}")
+            self._report(f"no program is heard any more: {action}")
             self.set_mode(action, now)
 
     def _arm(self, message: Any, now: int) -> int:  # noqa: ARG002
         vehicle = self._vehicle
         if message.param1 == 1:
             if not vehicle.ready:
-                self._tell("arming denied: expected a pose of the vehicle, found none yet")
+                self._report("arming denied: expected a pose of the vehicle, found none yet")
                 return int(_LATER)
             if not vehicle.armed:
                 self._act(ev.Arm)
@@ -269,7 +266,7 @@ class Flight:
             return int(_OK)
         in_air = vehicle.landed_state != mav.MAV_LANDED_STATE_ON_GROUND
         if message.param1 != 0 or (in_air and message.param2 != FORCED):
-            self._tell("disarming denied: in the air")
+            self._report("disarming denied: in the air")
             return int(_NO)
         self._act(ev.Disarm)
         return int(_OK)
@@ -285,14 +282,14 @@ class Flight:
         height = vehicle.position[2] - place[2]
         if height < LEAST_CLIMB:
             above = "home" if GLOBAL_FRAMES.get(frame) else "sea level"
-            shown = f"{z:g} m above {above}" if frame in GLOBAL_FRAMES else f"{z:g} m down"
+            target = f"{z:g} m above {above}" if frame in GLOBAL_FRAMES else f"{z:g} m down"
             return self._denied(
                 "takeoff",
-                f"expected an altitude {LEAST_CLIMB:g} m or more above the vehicle, found {shown}, "
-                f"which is {-height:.1f} m below it",
+                f"expected an altitude {LEAST_CLIMB:g} m or more above the vehicle, found "
+                f"{target}, which is {-height:.1f} m below it",
             )
         if math.isfinite(x) and math.isfinite(y) and (x or y):
-            self._once("takeoff: its place is not flown to: it goes straight up")
+            self._warn_once("takeoff: its place is not flown to: it goes straight up")
         return self.set_mode("takeoff", now, climb=height)
 
     def _land(self, message: Any, now: int) -> int:
@@ -303,8 +300,8 @@ class Flight:
         if place is None or not self._flies:
             return self.set_mode("land", now)
         self.set_mode("hold", now)
-        self._go(place)
-        self._lands_there = True
+        self._set_goal(place)
+        self._lands_at_goal = True
         return int(_OK)
 
     def _landing_place(self, frame: int, x: float, y: float) -> Vector3 | None:
@@ -318,8 +315,8 @@ class Flight:
         vehicle = self._vehicle
         return vehicle.armed and vehicle.landed_state != mav.MAV_LANDED_STATE_ON_GROUND
 
-    def _denied(self, what: str, why: object) -> int:
-        self._tell(f"{what} denied: {why}")
+    def _denied(self, action: str, reason: object) -> int:
+        self._report(f"{action} denied: {reason}")
         return int(_NO)
 
     def _change_speed(self, speed: float) -> int:
@@ -330,12 +327,14 @@ class Flight:
         return int(_OK)
 
     def _start_mission(self, message: Any, now: int) -> int:
-        if self._missions.items and (why := self._missions.start(message.param1, message.param2)):
-            return self._denied("mission", why)
+        if self._missions.items and (
+            reason := self._missions.start(message.param1, message.param2)
+        ):
+            return self._denied("mission", reason)
         return self.set_mode("mission", now, resumes=False)
 
     def _reposition(self, message: Any, now: int) -> int:
-        """Go to a place; hold if it is where the vehicle is, as ground stations pause."""
+        """Fly to a place; hold if it is the vehicle's, as ground stations pause."""
         vehicle, place = self._vehicle, self._location(message)
         if not vehicle.armed or vehicle.home is None:
             return self._denied("reposition", "expected an armed vehicle, found it disarmed")
@@ -347,52 +346,52 @@ class Flight:
         if math.isfinite(message.param1) and message.param1 > 0:
             self._speed = message.param1
         if not all(map(math.isnan, (*place[1:], message.param4))):
-            self._go(goal, message.param4)
+            self._set_goal(goal, message.param4)
         return int(_OK)
 
-    def _go(self, place: Vector3, yaw: float = math.nan) -> None:
+    def _set_goal(self, place: Vector3, yaw: float = math.nan) -> None:
         vehicle = self._vehicle
         heading = yaw if math.isfinite(yaw) else yaw_of(vehicle.orientation)
         self._goal, self._carrot = (place, heading), vehicle.position
         self._followed = None
 
     def _follow(self, now: int) -> None:
-        """Move the carrot on, and see whether the place is reached."""
+        """Advance the carrot, and check whether the place is reached."""
         assert self._goal is not None
         place, heading = self._goal
         seconds = 0.0 if self._followed is None else (now - self._followed) / SECOND
         self._followed = now
         speed = self._speed or self._parameters["MPC_XY_CRUISE"]
-        left = math.dist(self._carrot, place)
-        part = 1.0 if left <= speed * seconds else speed * seconds / left
+        distance = math.dist(self._carrot, place)
+        part = 1.0 if distance <= speed * seconds else speed * seconds / distance
         x, y, z = (a + part * (b - a) for a, b in zip(self._carrot, place, strict=True))
         self._carrot = (x, y, z)
         self._act(ev.PositionSetpoint, position=self._carrot, yaw=heading)
         if part < 1.0 or math.dist(self._vehicle.position, place) > ARRIVED:
             return
         self._goal, item = None, self._missions.current()
-        if self._vehicle.mode == "mission" and item is not None and not self._lands_there:
+        if self._vehicle.mode == "mission" and item is not None and not self._lands_at_goal:
             stay = item.params[0] if item.command == mav.MAV_CMD_NAV_WAYPOINT else 0
             self._wait_until = now + (round(stay * SECOND) if 0 < stay <= LONGEST_STAY else 0)
-        elif self._lands_there:
+        elif self._lands_at_goal:
             by_item = self._vehicle.mode == "mission"
             self.set_mode("land", now)
             self._missions.landing = by_item
 
-    def _go_on_with_mission(self, now: int) -> None:
-        """Begin with a mission's item, or see whether it has been stayed at for long enough."""
+    def _update_mission(self, now: int) -> None:
+        """Start a mission's item, or wait until its stay is over."""
         if self._wait_until is not None:
             if now < self._wait_until:
                 return
             self._wait_until = None
             self._missions.reached()
         if self._goal is None:
-            self._begin_item(now)
+            self._start_item(now)
 
-    def _begin_item(self, now: int) -> None:
+    def _start_item(self, now: int) -> None:
         vehicle, item = self._vehicle, self._missions.current()
         if item is None:
-            self._tell_end()
+            self._report_end()
             self.set_mode("hold", now)
             return
         kind = item.command
@@ -402,7 +401,7 @@ class Flight:
                 landing = self._landing_place(*item.place[:3])
             place = vehicle.place_of(*item.place) if kind in _PLACES else landing
         except ValueError as error:  # as of a place known in part, once the vehicle is far away
-            self._tell(f"mission: {error}: holding")
+            self._report(f"mission: {error}: holding")
             self.set_mode("hold", now)
             return
         if kind in _PLACES and not vehicle.armed:
@@ -410,8 +409,8 @@ class Flight:
         if place is not None:
             if kind == mav.MAV_CMD_NAV_TAKEOFF:
                 place = (*vehicle.position[:2], place[2])
-            self._go(place, math.nan if landing else math.radians(item.params[3]))
-            self._lands_there = landing is not None
+            self._set_goal(place, math.nan if landing else math.radians(item.params[3]))
+            self._lands_at_goal = landing is not None
         elif kind == mav.MAV_CMD_DO_CHANGE_SPEED:
             self._change_speed(item.params[1])
             self._missions.reached()
@@ -426,10 +425,10 @@ class Flight:
             self._missions.reached()
             self.set_mode("return", now)
 
-    def _tell_end(self) -> None:
-        """Tell that there is no further item."""
+    def _report_end(self) -> None:
+        """Report that there is no further item."""
         if self._missions.current() is None:
-            self._tell("mission finished" if self._missions.items else "mission cleared: holding")
+            self._report("mission finished" if self._missions.items else "mission cleared: holding")
 
     def _location(self, message: Any) -> tuple[int, float, float, float]:
         """Return a command's frame and place, as `Vehicle.place_of` takes it."""
@@ -444,7 +443,7 @@ class Flight:
         )
         return message.frame, x, y, message.z
 
-    def why_not(self, item: Item) -> str:
+    def refusal(self, item: Item) -> str:
         """Return why a mission's item cannot be flown; empty if it can."""
         kind = item.command
         try:

@@ -51,7 +51,7 @@ class Peer:
         self.end, self.name = end, name
         self.is_stream = end.type == socket.SOCK_STREAM
         self.unsent = bytearray()  # of a stream
-        self.heard = -math.inf
+        self.received_at = -math.inf
         self.parser = mav.MAVLink(None, *ids)
         self.parser.robust_parsing = True
         if key:
@@ -78,7 +78,7 @@ class Peer:
             return None
 
     def messages(self, data: bytes) -> list[Any]:
-        """Return the messages in some bytes; a datagram goes on from nothing before it."""
+        """Return the messages in some bytes; a datagram starts with a new message."""
         if not self.is_stream:
             self.parser.buf, self.parser.buf_index = bytearray(), 0
             self.parser.expected_length = mav.HEADER_LEN_V1 + 2
@@ -88,7 +88,7 @@ class Peer:
 class Links:
     """All links of a vehicle.
 
-    UDP links speak to one address and hear it alone; TCP links listen. Nobody is waited for.
+    UDP links exchange datagrams with one address; TCP links listen. No call waits for a peer.
     """
 
     def __init__(self, ids: tuple[int, int], key: bytes, receive: Receive, log: NodeLogger) -> None:
@@ -96,7 +96,7 @@ class Links:
         self._loop = asyncio.get_running_loop()
         self.peers: list[Peer] = []
         self._listeners: list[socket.socket] = []
-        self._now, self._left = 0.0, BURST
+        self._now, self._budget = 0.0, BURST
         self._muted: list[Peer] = []
         self.counts: Counter[str] = Counter()
 
@@ -131,47 +131,47 @@ class Links:
             return
         try:
             peer.end.send(data)
-        except OSError:  # nobody listens, or its buffer is full: datagrams may get lost
+        except OSError:  # the port is closed, or its buffer full: datagrams may get lost
             self.counts["datagrams not taken"] += 1
 
     def quiet_for(self, now: float) -> float:
-        """Return the seconds since any peer was heard; infinite if never."""
-        return now - max((peer.heard for peer in self.peers), default=-math.inf)
+        """Return the seconds since the last message of any peer; infinite if there was none."""
+        return now - max((peer.received_at for peer in self.peers), default=-math.inf)
 
     def refill(self, now: float) -> None:
-        """Begin a period: what waits is read again."""
-        self._now, self._left = now, BURST
+        """Start a period: peers that were paused are read again."""
+        self._now, self._budget = now, BURST
         muted, self._muted = self._muted, []
         for peer in muted:
             if peer in self.peers:
-                self._loop.add_reader(peer.end, self.hear, peer)
+                self._loop.add_reader(peer.end, self.read, peer)
 
-    def hear(self, peer: Peer) -> None:
-        """Read what has come from a peer; hang up where a stream has ended."""
+    def read(self, peer: Peer) -> None:
+        """Read a peer's data; disconnect a stream that has ended."""
         try:
             data = peer.end.recv(4096 if peer.is_stream else 65535)
         except (BlockingIOError, InterruptedError):
             return
-        except OSError:  # of datagrams: nobody listens there yet
+        except OSError:  # of datagrams: the port is not open yet
             data = b""
         if data:
-            self._take(peer, data)
+            self._handle_data(peer, data)
         elif peer.is_stream:
-            self._hang_up(peer)
+            self._disconnect(peer)
 
     def close(self) -> None:
-        """Close all sockets; log what was odd."""
+        """Close all sockets; log the counts of unusual messages."""
         for peer in [*self.peers]:
-            self._hang_up(peer)
+            self._disconnect(peer)
         for end in self._listeners:
             self._loop.remove_reader(end)
             end.close()
-        odd = ", ".join(f"{n} {what}" for what, n in self.counts.items() if what != "messages")
+        odd = ", ".join(f"{n} {name}" for name, n in self.counts.items() if name != "messages")
         self._log.info("%d messages heard%s", self.counts["messages"], odd and f"; {odd}")
 
     def _adopt(self, end: socket.socket, name: str) -> None:
         self.peers.append(peer := Peer(end, name, self._ids, self._key))
-        self._loop.add_reader(end, self.hear, peer)
+        self._loop.add_reader(end, self.read, peer)
 
     def _accept(self, listener: socket.socket) -> None:
         try:
@@ -184,7 +184,7 @@ class Links:
             return
         self._adopt(end, f"tcp://{host}:{port}")
 
-    def _take(self, peer: Peer, data: bytes) -> None:
+    def _handle_data(self, peer: Peer, data: bytes) -> None:
         for message in peer.messages(data):
             if message.get_type() == "BAD_DATA":
                 self.counts["pieces of garbage"] += 1
@@ -192,16 +192,16 @@ class Links:
                 self.counts["messages in our own name"] += 1
             else:
                 self.counts["messages"] += 1
-                peer.heard = self._now
+                peer.received_at = self._now
                 self._deliver(peer, message)
-            self._left -= 1
-        if self._left <= 0 and peer in self.peers:
+            self._budget -= 1
+        if self._budget <= 0 and peer in self.peers:
             self.counts["pauses in a flood"] += 1
             self._loop.remove_reader(peer.end)
             self._muted.append(peer)
 
     def _deliver(self, peer: Peer, message: Any) -> None:
-        """Hand a message on; an error in its handler must not lose those read with it."""
+        """Pass a message on; an error in its handler must not lose those read with it."""
         sender = _sender(message)
         try:
             self._receive(peer, sender, message)
@@ -215,7 +215,7 @@ class Links:
         peer.unsent += data
         if len(peer.unsent) > LONGEST_QUEUE:
             self._log.warning("%s takes nothing: hung up", peer.name)
-            self._hang_up(peer)
+            self._disconnect(peer)
         elif len(peer.unsent) == len(data):
             self._flush(peer)
 
@@ -225,14 +225,14 @@ class Links:
         except (BlockingIOError, InterruptedError):
             pass
         except OSError:
-            self._hang_up(peer)
+            self._disconnect(peer)
             return
         if peer.unsent:
             self._loop.add_writer(peer.end, self._flush, peer)
         else:
             self._loop.remove_writer(peer.end)
 
-    def _hang_up(self, peer: Peer) -> None:
+    def _disconnect(self, peer: Peer) -> None:
         self._loop.remove_reader(peer.end)
         self._loop.remove_writer(peer.end)
         self.peers = [other for other in self.peers if other is not peer]
@@ -243,7 +243,7 @@ class Wire:
     """PX4's connection; its methods block, and are called beside the loop.
 
     Raises:
-        OSError: Nobody can listen on this address.
+        OSError: The address cannot be listened on.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -270,7 +270,7 @@ class Wire:
                 return
 
     def exchange(self, messages: list[Any], patience: float) -> Any:
-        """Send what was measured, and return the answer; `None` while PX4 starts, or at the end.
+        """Send measurements, and return the answer; `None` while PX4 starts, or at the end.
 
         Raises:
             ConnectionError: PX4 has gone.
@@ -287,12 +287,12 @@ class Wire:
             raise ConnectionError(f"PX4 has gone after {self.answers} answers: {error}") from None
         end = time.monotonic() + (patience if self.answers else STARTING)
         while not self._closed:
-            left = end - time.monotonic()
-            if left <= 0:
+            remaining = end - time.monotonic()
+            if remaining <= 0:
                 if self.answers:
                     raise TimeoutError(f"expected PX4's next answer, waited {patience:g} s")
                 return None
-            self._peer.settimeout(min(left, SLICE))
+            self._peer.settimeout(min(remaining, SLICE))
             try:
                 data = self._peer.recv(65536)
             except TimeoutError:
@@ -308,7 +308,7 @@ class Wire:
         return None
 
     def close(self) -> None:
-        """Hang up, and end what waits."""
+        """Close the connection, and end waiting calls."""
         self._closed = True
         self._listener.close()
         if self._peer is not None:
@@ -330,7 +330,7 @@ def _packed(message: Any, parser: Any) -> bytes:
 
 
 def ardupilot_dialect() -> Any:
-    """Return ArduPilot's dialect, whose import takes a while, and is for nobody else."""
+    """Return ArduPilot's dialect, imported when needed as that takes a while."""
     from pymavlink.dialects.v20 import ardupilotmega
 
     return ardupilotmega

@@ -47,13 +47,13 @@ class Upload:
     """An upload under way.
 
     Attributes:
-        asked: When the next item was asked for (ns), and `tries` how often.
-        by_int: Whether items are asked for by ``MISSION_REQUEST_INT``, as some programs want.
+        requested_at: Time of the next item's last request (ns); `tries` counts the requests.
+        by_int: Whether items are requested by ``MISSION_REQUEST_INT``, as some programs expect.
     """
 
     sender: Sender
     count: int
-    asked: int = 0
+    requested_at: int = 0
     tries: int = 0
     by_int: bool = False
     items: list[Item] = field(default_factory=list)
@@ -63,11 +63,11 @@ class Guided(NamedTuple):
     """Conventions of ArduPilot: items that are flown to at once, and home as a mission's first.
 
     Attributes:
-        go_to: Flies to an item's place at a time (ns); returns why not.
+        fly_to: Flies to an item's place at a time (ns); returns the reason if it cannot.
     """
 
     vehicle: Vehicle
-    go_to: Callable[[Item, int], str]
+    fly_to: Callable[[Item, int], str]
 
     @property
     def home(self) -> Item:
@@ -81,9 +81,10 @@ class Missions:
     """The vehicle's mission.
 
     Args:
-        vehicle: Whose mode says whether it is flown.
-        send: Sends a message to all programs, who know by its target whether it is for them.
-        why_not: Returns why an item cannot be flown; empty if it can.
+        vehicle: Its mode determines whether the mission is flown.
+        send: Sends a message to all programs; its target says which is meant.
+        refusal: Returns why an item cannot be flown; empty if it can.
+        report: Sends a sentence to all programs, and to the log.
         changed: Called when another item than the next one is to be flown.
         guided: ArduPilot's conventions, if those count.
     """
@@ -92,13 +93,13 @@ class Missions:
         self,
         vehicle: Vehicle,
         send: Callable[[Any], None],
-        why_not: Callable[[Item], str],
-        tell: Callable[[str], None],
+        refusal: Callable[[Item], str],
+        report: Callable[[str], None],
         changed: Callable[[], None],
         guided: Guided | None = None,
     ) -> None:
-        self._vehicle, self._send, self._why_not = vehicle, send, why_not
-        self._tell, self._changed = tell, changed
+        self._vehicle, self._send, self._refusal = vehicle, send, refusal
+        self._report, self._changed = report, changed
         self.items: list[Item] = []
         self._guided, self._first = guided, int(guided is not None)
         self._next = self._end = 0  # the item under way, and the one before which it ends
@@ -118,24 +119,24 @@ class Missions:
         return self.items[self._next] if self._next < self._end else None
 
     def reached(self) -> None:
-        """Go on to the next item, and say so."""
+        """Advance to the next item, and report the reached one."""
         self._send(mav.MAVLink_mission_item_reached_message(self._next))
         self._next += 1
         self.landing = False
         self._progress()
 
     def resume(self) -> None:
-        """Go on where it was left; from the first item after the last one."""
+        """Continue at the item under way; after the last one, from the first."""
         self._end = len(self.items)
         if self._next >= self._end:
             self._next = self._first
             self._progress()
 
     def start(self, first: float, last: float) -> str:
-        """Go on from an item until another one; return why not.
+        """Continue from one item to another; return the reason if that is impossible.
 
         Args:
-            first: Number of an item; below zero, or NaN: where it was left.
+            first: Number of an item; below zero, or NaN: the one under way.
             last: Number of the last one; zero, or beyond the last: all.
         """
         if not self.items:
@@ -147,36 +148,36 @@ class Missions:
         elif 0 < last < int(first):
             return f"expected a last item after the first, found {first:g} and {last:g}"
         else:
-            self._go_to(int(first))
+            self._jump_to(int(first))
         if 0 < last < len(self.items):
             self._end = int(last) + 1
         return ""
 
     def jump(self, number: float) -> int:
-        """Go on with an item, -1 for the one under way; return a ``MAV_RESULT``."""
+        """Continue with an item, -1 for the one under way; return a ``MAV_RESULT``."""
         if number == -1:
             return int(mav.MAV_RESULT_ACCEPTED)
         if not 0 <= number < len(self.items):
-            self._tell(f"mission: expected an item below {len(self.items)}, found {number:g}")
+            self._report(f"mission: expected an item below {len(self.items)}, found {number:g}")
             return int(mav.MAV_RESULT_DENIED)
-        self._go_to(int(number))
+        self._jump_to(int(number))
         return int(mav.MAV_RESULT_ACCEPTED)
 
-    def hear(self, sender: Sender, message: Any, now: int) -> str:
+    def handle(self, sender: Sender, message: Any, now: int) -> str:
         """Answer a message of the mission protocol; return why it has no effect, if so."""
         kind, which = message.get_type(), getattr(message, "mission_type", _MISSION)
         if kind == "MISSION_SET_CURRENT":
             self.jump(message.seq)
         elif which != _MISSION and not (kind == "MISSION_CLEAR_ALL" and which == _ALL):
-            return self._hear_other(sender, kind, which)
+            return self._handle_unsupported(sender, kind, which)
         elif kind == "MISSION_COUNT":
-            return self._begin(sender, message.count, now)
+            return self._start_upload(sender, message.count, now)
         elif kind in {"MISSION_ITEM_INT", "MISSION_ITEM"}:
-            return self._hear_item(sender, message, now)
+            return self._handle_item(sender, message, now)
         elif kind == "MISSION_REQUEST_LIST":
             self._send(mav.MAVLink_mission_count_message(*sender, self._count, _MISSION))
         elif kind in {"MISSION_REQUEST_INT", "MISSION_REQUEST"}:
-            self._give(sender, message.seq, kind == "MISSION_REQUEST_INT")
+            self._send_item(sender, message.seq, kind == "MISSION_REQUEST_INT")
         elif kind == "MISSION_CLEAR_ALL":
             if self._is_busy(sender):
                 return "another program uploads"
@@ -184,23 +185,23 @@ class Missions:
             self._replace([])
             self._ack(sender, mav.MAV_MISSION_ACCEPTED, which)
         elif kind == "MISSION_ACK":
-            self._hear_ack(sender, message.type, now)
+            self._handle_ack(sender, message.type, now)
         return ""
 
     def update(self, now: int) -> None:
-        """Ask again for an item that did not come."""
+        """Request an item again that did not arrive."""
         upload = self._upload
-        if upload is None or now - upload.asked < PATIENCE:
+        if upload is None or now - upload.requested_at < PATIENCE:
             return
         upload.tries += 1
         if upload.tries > TRIES:
-            self._tell(f"mission: expected item {len(upload.items)}, it never came")
+            self._report(f"mission: expected item {len(upload.items)}, it never came")
             self._finish(upload, mav.MAV_MISSION_OPERATION_CANCELLED)
         else:
-            self._ask(upload, now)
+            self._request_item(upload, now)
 
-    def _hear_other(self, sender: Sender, kind: str, which: int) -> str:
-        """Answer what is about a fence or rally points, of which there are none."""
+    def _handle_unsupported(self, sender: Sender, kind: str, which: int) -> str:
+        """Answer a message about fences or rally points, of which there are none."""
         if kind == "MISSION_ACK":
             return ""
         if which in _OTHERS and kind == "MISSION_REQUEST_LIST":
@@ -213,13 +214,13 @@ class Missions:
         return ""
 
     def _is_busy(self, sender: Sender) -> bool:
-        """Refuse to disturb another program's upload."""
+        """Return whether another program uploads; refuse the sender's message then."""
         if self._upload is None or self._upload.sender == sender:
             return False
         self._ack(sender, mav.MAV_MISSION_DENIED)
         return True
 
-    def _begin(self, sender: Sender, count: int, now: int) -> str:
+    def _start_upload(self, sender: Sender, count: int, now: int) -> str:
         if self._is_busy(sender):
             return "another program uploads"
         if count > MOST_ITEMS:
@@ -227,64 +228,64 @@ class Missions:
             return f"expected at most {MOST_ITEMS} items, found {count}"
         self._upload = upload = Upload(sender, count)
         if count:
-            self._ask(upload, now)
+            self._request_item(upload, now)
         else:
             self._finish(upload, mav.MAV_MISSION_ACCEPTED)
         return ""
 
-    def _hear_item(self, sender: Sender, message: Any, now: int) -> str:
+    def _handle_item(self, sender: Sender, message: Any, now: int) -> str:
         upload = self._upload
         if self._is_busy(sender):
             return "another program uploads"
         if upload is None and message.current == GUIDED:
-            return self._go_at_once(sender, message, now)
+            return self._fly_guided(sender, message, now)
         if upload is None and self._done == (sender, message.seq):  # the answer got lost
             self._ack(sender, mav.MAV_MISSION_ACCEPTED)
         elif upload is None:
             self._ack(sender, mav.MAV_MISSION_ERROR)
             return "expected MISSION_COUNT first"
         elif message.seq == len(upload.items):  # else it came twice
-            self._take(upload, message, now)
+            self._add_item(upload, message, now)
         return ""
 
-    def _go_at_once(self, sender: Sender, message: Any, now: int) -> str:
-        words, item = "guided places are ArduPilot's: send DO_REPOSITION", _item(message)
+    def _fly_guided(self, sender: Sender, message: Any, now: int) -> str:
+        reason, item = "guided places are ArduPilot's: send DO_REPOSITION", _item(message)
         if self._guided is not None:
-            words = "its place is none" if item is None else self._guided.go_to(item, now)
-        self._ack(sender, mav.MAV_MISSION_UNSUPPORTED if words else mav.MAV_MISSION_ACCEPTED)
-        return words
+            reason = "its place is none" if item is None else self._guided.fly_to(item, now)
+        self._ack(sender, mav.MAV_MISSION_UNSUPPORTED if reason else mav.MAV_MISSION_ACCEPTED)
+        return reason
 
-    def _take(self, upload: Upload, message: Any, now: int) -> None:
+    def _add_item(self, upload: Upload, message: Any, now: int) -> None:
         upload.by_int = upload.by_int or message.get_type() == "MISSION_ITEM_INT"
         item = _item(message)
         if item is None:
-            self._tell(f"mission refused: item {message.seq}: its place is none")
+            self._report(f"mission refused: item {message.seq}: its place is none")
             self._finish(upload, mav.MAV_MISSION_INVALID)
             return
         is_home = message.seq < self._first
-        if not is_home and (why := self._why_not(item)):
-            self._tell(f"mission refused: item {message.seq}: {why}")
+        if not is_home and (reason := self._refusal(item)):
+            self._report(f"mission refused: item {message.seq}: {reason}")
             self._finish(upload, mav.MAV_MISSION_UNSUPPORTED)
             return
         upload.items.append(item)
         upload.tries = 0
         if len(upload.items) < upload.count:
-            self._ask(upload, now)
+            self._request_item(upload, now)
         else:
             self._finish(upload, mav.MAV_MISSION_ACCEPTED)
 
-    def _hear_ack(self, sender: Sender, result: int, now: int) -> None:
-        """Ask by integers if an uploading program wants it so; end if it gives up."""
+    def _handle_ack(self, sender: Sender, result: int, now: int) -> None:
+        """Request integers if an uploading program refuses floats; end if it cancels."""
         upload = self._upload
         if upload is None or upload.sender != sender:
             return
         if result == mav.MAV_MISSION_UNSUPPORTED and not upload.by_int:
             upload.by_int = True
-            self._ask(upload, now)
+            self._request_item(upload, now)
         elif result == mav.MAV_MISSION_OPERATION_CANCELLED:
             self._upload = None
 
-    def _give(self, sender: Sender, seq: int, by_int: bool) -> None:
+    def _send_item(self, sender: Sender, seq: int, by_int: bool) -> None:
         if not 0 <= seq < self._count:
             self._ack(sender, mav.MAV_MISSION_INVALID_SEQUENCE)
             return
@@ -299,8 +300,8 @@ class Missions:
             kind = mav.MAVLink_mission_item_message
         self._send(kind(*head, *item.params, *place, item.z, _MISSION))
 
-    def _ask(self, upload: Upload, now: int) -> None:
-        upload.asked = now
+    def _request_item(self, upload: Upload, now: int) -> None:
+        upload.requested_at = now
         by_int, plain = mav.MAVLink_mission_request_int_message, mav.MAVLink_mission_request_message
         kind = by_int if upload.by_int else plain
         self._send(kind(*upload.sender, len(upload.items), _MISSION))
@@ -314,9 +315,9 @@ class Missions:
 
     def _replace(self, items: list[Item]) -> None:
         self.items = items
-        self._go_to(0)
+        self._jump_to(0)
 
-    def _go_to(self, number: int) -> None:
+    def _jump_to(self, number: int) -> None:
         self._next, self._end = max(number, self._first), len(self.items)
         self.landing = False
         self._progress()
@@ -345,8 +346,8 @@ class Missions:
             return int(mav.MISSION_STATE_COMPLETE)
         if self._is_flown:
             return int(mav.MISSION_STATE_ACTIVE)
-        begun = self._next > self._first
-        return int(mav.MISSION_STATE_PAUSED if begun else mav.MISSION_STATE_NOT_STARTED)
+        is_started = self._next > self._first
+        return int(mav.MISSION_STATE_PAUSED if is_started else mav.MISSION_STATE_NOT_STARTED)
 
 
 def _item(message: Any) -> Item | None:

@@ -73,7 +73,7 @@ class Mavlink(VehicleController[MavlinkConfig]):
         origins = [getattr(node.config, "origin", None) for node in self.siblings(Node)]
         origin = next(filter(None, origins), ORIGIN)
         self._endpoint = MavlinkEndpoint(
-            self.config, origin, self._act, self._see, self.clock.now, self.log
+            self.config, origin, self._act, self._publish_pose, self.clock.now, self.log
         )
         self._endpoint.open()
 
@@ -95,45 +95,45 @@ class Mavlink(VehicleController[MavlinkConfig]):
             self._imus[announcement.source] = announcement.orientation
 
     def check(self) -> Iterable[str]:
-        """Say if there is nothing to fly, or time runs away from programs."""
+        """Yield an error if there is nothing to fly, or if time is faster than real time."""
         if not self._vehicles:
-            wanted = self.config.vehicle or "a vehicle"
-            yield f"expected {wanted} to fly, found none: add one, such as a Multirotor"
-        wanted = self.config.telemetry
-        if wanted and wanted not in self._estimators:
-            there = ", ".join(self._estimators) or "none"
-            yield f'telemetry: expected an estimator, found "{wanted}"; there are: {there}'
+            expected = self.config.vehicle or "a vehicle"
+            yield f"expected {expected} to fly, found none: add one, such as a Multirotor"
+        expected = self.config.telemetry
+        if expected and expected not in self._estimators:
+            listed = ", ".join(self._estimators) or "none"
+            yield f'telemetry: expected an estimator, found "{expected}"; there are: {listed}'
         speed = self.stepping.target_speed
         if not self.stepping.fixed() and (speed is None or speed > 1.0):
-            shown = "no limit" if speed is None else f"{speed:g}"
-            yield f"expected run.speed = 1.0 or less, for programs keep real time, found {shown}"
+            limit = "no limit" if speed is None else f"{speed:g}"
+            yield f"expected run.speed = 1.0 or less, for programs keep real time, found {limit}"
 
     @on(Odometry)
     def odometry(self, event: Odometry) -> None:
-        """Take note of the true pose."""
+        """Store the true pose."""
         if self._endpoint and not self.config.telemetry and event.source == self._vehicles[0]:
-            self._endpoint.vehicle.note(event)
+            self._endpoint.vehicle.set_pose(event)
 
     @on(Imu, MagneticField, FluidPressure)
     def samples(self, event: Imu | MagneticField | FluidPressure) -> None:
-        """Take note of what the vehicle's sensors measure."""
+        """Store the samples of the vehicle's sensors."""
         if self._endpoint and self._is_aboard(event.source):
-            self._endpoint.vehicle.measure(event)
+            self._endpoint.vehicle.add_sample(event)
 
     @on(PoseEstimate)
     def poses(self, event: PoseEstimate) -> None:
-        """Take note of the estimated pose."""
+        """Store the estimated pose."""
         if self._endpoint and event.source == self.config.telemetry:
-            self._endpoint.vehicle.note(event)
+            self._endpoint.vehicle.set_pose(event)
 
     @on(VehicleEvent)
     def vehicle_events(self, event: VehicleEvent) -> None:
-        """Take note of arming, take-off and landing."""
+        """Handle arming, take-off and landing."""
         if self._endpoint and event.source == self._vehicles[0]:
-            self._endpoint.flight.noted(event)
+            self._endpoint.flight.handle_event(event)
 
     async def on_ready(self) -> None:
-        """Take note of the vehicle's IMU."""
+        """Store the orientation of the vehicle's IMU."""
         for source, orientation in self._imus.items():
             if self._endpoint and self._is_aboard(source):
                 self._endpoint.vehicle.imu_orientation = orientation
@@ -145,7 +145,7 @@ class Mavlink(VehicleController[MavlinkConfig]):
             self._endpoint.update(tick.stamp, self.wall())
 
     async def on_end(self) -> None:
-        """Tell how many poses came from outside."""
+        """Report how many poses came from outside."""
         if self._endpoint and (text := self._endpoint.finish()):
             self.note_environment(f"{self.name}: poses from outside", text)
 
@@ -164,7 +164,7 @@ class Mavlink(VehicleController[MavlinkConfig]):
         else:
             self.setpoints.send(event)
 
-    def _see(self, **fields: Any) -> None:
+    def _publish_pose(self, **fields: Any) -> None:
         self.estimates.send(PoseEstimate(source=self.name, **fields))
 
 
@@ -227,7 +227,7 @@ class Px4(VehicleController[Px4Config]):
             self._imus.append(announcement)
 
     def check(self) -> Iterable[str]:
-        """Say what is missing, or cannot be what PX4 expects."""
+        """Yield an error for each missing part, and for each that PX4 does not expect."""
         if len(self._vehicles) != 1:
             names = ", ".join(self._vehicles) or "none"
             yield f"expected one vehicle whose motors to drive, found {names}: set vehicle"
@@ -239,21 +239,21 @@ class Px4(VehicleController[Px4Config]):
 
     @on(MagneticField)
     def fields(self, event: MagneticField) -> None:
-        """Note the newest, for the next sample."""
+        """Store the newest, for the next sample."""
         self._field = event
 
     @on(FluidPressure)
     def pressures(self, event: FluidPressure) -> None:
-        """Note the newest, for the next sample."""
+        """Store the newest, for the next sample."""
         self._pressure = event
 
     @on(NavSatFix)
     def fixes(self, event: NavSatFix) -> None:
-        """Note the newest, for the next sample."""
+        """Store the newest, for the next sample."""
         self._fix = event
 
     async def run(self) -> None:
-        """Give each sample to PX4, and its answer to the motors."""
+        """Send each sample to PX4, and its answer to the motors."""
         from visnav_mavlink.links import motors, satellites, sensors
 
         assert self._wire is not None
@@ -271,7 +271,7 @@ class Px4(VehicleController[Px4Config]):
                 self._obey(*motors(answer))
 
     async def on_shutdown(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         if self._wire is not None:
             self._wire.close()
 
@@ -292,5 +292,5 @@ def _expect_library(node: str) -> None:
     try:
         import visnav_mavlink.links  # noqa: F401
     except ImportError as error:
-        wanted = "pip install ./extensions/mavlink"
-        raise MissingDependencyError(f"{node} needs pymavlink ({error}): {wanted}") from error
+        command = "pip install ./extensions/mavlink"
+        raise MissingDependencyError(f"{node} needs pymavlink ({error}): {command}") from error

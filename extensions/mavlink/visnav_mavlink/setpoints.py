@@ -25,7 +25,7 @@ _FORCE, _NO_YAW, _NO_YAW_RATE = 1 << 9, 1 << 10, 1 << 11
 _NO_RATES, _THRUST_BODY, _NO_THRUST, _NO_ATTITUDE = 0b111, 1 << 5, 1 << 6, 1 << 7
 
 
-class Made(NamedTuple):
+class ConvertedSetpoint(NamedTuple):
     """A set-point.
 
     Attributes:
@@ -48,27 +48,27 @@ class Offboard:
         self.stamp = -(1 << 62)
         self._turned: tuple[int, float] | None = None  # stamp and heading beside a yaw rate
 
-    def take(self, message: Any, now: int) -> Made:
-        """Take a message; a `ValueError` says why it cannot be followed."""
-        made = self._made(message, now)
+    def accept(self, message: Any, now: int) -> ConvertedSetpoint:
+        """Store and convert a message; a `ValueError` says why it cannot be followed."""
+        setpoint = self._convert(message, now)
         self._message, self.stamp = message, now
-        return made
+        return setpoint
 
-    def again(self, now: int, all_of_them: bool = False) -> Made | None:
-        """Return the newest message's set-point anew, if it depends on the vehicle's state."""
+    def renew(self, now: int, all_of_them: bool = False) -> ConvertedSetpoint | None:
+        """Convert the newest message again, if its set-point depends on the vehicle's state."""
         try:
-            made = None if self._message is None else self._made(self._message, now)
+            setpoint = None if self._message is None else self._convert(self._message, now)
         except ValueError:  # it was followed, but the vehicle is too far away by now
             return None
-        return made if made is not None and (all_of_them or made.depends) else None
+        return setpoint if setpoint is not None and (all_of_them or setpoint.depends) else None
 
-    def _made(self, message: Any, now: int) -> Made:
+    def _convert(self, message: Any, now: int) -> ConvertedSetpoint:
         if message.get_type() == "SET_ATTITUDE_TARGET":
             return self._attitude(message, now)
         self._turned = None
         return self._target(message)
 
-    def _target(self, message: Any) -> Made:
+    def _target(self, message: Any) -> ConvertedSetpoint:
         mask, frame, vehicle = message.type_mask, message.coordinate_frame, self._vehicle
         if message.get_type() == "SET_POSITION_TARGET_GLOBAL_INT":
             frames: Any = GLOBAL_FRAMES
@@ -77,58 +77,64 @@ class Offboard:
             frames, numbers = _NED | _BODY, (message.x, message.y, message.z)
         if frame not in frames:
             raise ValueError(f"expected a coordinate_frame of {sorted(frames)}, found {frame}")
-        place = _given(numbers, mask)
-        velocity = _given((message.vx, message.vy, message.vz), mask >> 3)
-        acceleration = _given((message.afx, message.afy, message.afz), mask >> 6)
-        yaw, yaw_rate = _given((message.yaw, message.yaw_rate), mask >> 10)
+        place = _unmasked(numbers, mask)
+        velocity = _unmasked((message.vx, message.vy, message.vz), mask >> 3)
+        acceleration = _unmasked((message.afx, message.afy, message.afz), mask >> 6)
+        yaw, yaw_rate = _unmasked((message.yaw, message.yaw_rate), mask >> 10)
         if mask & _FORCE and not all(map(math.isnan, acceleration)):
             raise ValueError("forces are not followed")
-        own = yaw_of(vehicle.orientation)
+        current_yaw = yaw_of(vehicle.orientation)
         turn = _or_zero(yaw_rate)
-        held = [not math.isnan(coordinate) for coordinate in place]
-        if not any(held) and all(map(math.isnan, velocity)):
+        fixed = [not math.isnan(coordinate) for coordinate in place]
+        if not any(fixed) and all(map(math.isnan, velocity)):
             raise ValueError("expected a position or a velocity, found neither")
         speeds = [_or_zero(speed) for speed in velocity]
-        if any(held):
+        if any(fixed):
             if frame in _BODY or frame == mav.MAV_FRAME_LOCAL_OFFSET_NED:
                 raise ValueError(f"expected a place in frame LOCAL_NED, found frame {frame}")
             position = vehicle.place_of(frame, place[0], place[1], place[2])
-            if all(held):
+            if all(fixed):
                 fields = {
                     "position": position,
                     "velocity": tuple(speeds),
                     "acceleration": tuple(map(_or_zero, acceleration)),
-                    "yaw": own if math.isnan(yaw) else yaw,
+                    "yaw": current_yaw if math.isnan(yaw) else yaw,
                     "yaw_rate": turn,
                 }
-                return Made(ev.PositionSetpoint, fields, math.isnan(yaw) and turn != 0.0)
+                return ConvertedSetpoint(
+                    ev.PositionSetpoint, fields, math.isnan(yaw) and turn != 0.0
+                )
             for axis in range(3):
-                if held[axis]:
+                if fixed[axis]:
                     speed = PLACE_GAIN * (position[axis] - vehicle.position[axis])
                     speeds[axis] += min(max(speed, -FASTEST), FASTEST)
         if not math.isnan(yaw):
-            turn += YAW_GAIN * math.remainder(yaw - own, math.tau)
+            turn += YAW_GAIN * math.remainder(yaw - current_yaw, math.tau)
         fields = {
             "velocity": tuple(speeds),
             "yaw_rate": turn,
             "frame_id": "heading" if frame in _BODY else "map",
         }
         dropped = "accelerations beside velocities" if any(map(_or_zero, acceleration)) else ""
-        return Made(ev.VelocitySetpoint, fields, any(held) or not math.isnan(yaw), dropped)
+        return ConvertedSetpoint(
+            ev.VelocitySetpoint, fields, any(fixed) or not math.isnan(yaw), dropped
+        )
 
-    def _attitude(self, message: Any, now: int) -> Made:
+    def _attitude(self, message: Any, now: int) -> ConvertedSetpoint:
         mask, thrust = message.type_mask, message.thrust
         if mask & _THRUST_BODY:
             raise ValueError("expected a thrust, found thrust_body")
         if mask & _NO_THRUST or not math.isfinite(thrust):
             raise ValueError("expected a thrust, found it ignored")
         numbers = message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate
-        rates = tuple(map(_or_zero, _given(numbers, mask)))
+        rates = tuple(map(_or_zero, _unmasked(numbers, mask)))
         if mask & _NO_ATTITUDE:
             self._turned = None
             if mask & _NO_RATES == _NO_RATES:
                 raise ValueError("expected an attitude or rates, found neither")
-            return Made(ev.BodyRateSetpoint, {"angular_velocity": rates, "thrust": thrust})
+            return ConvertedSetpoint(
+                ev.BodyRateSetpoint, {"angular_velocity": rates, "thrust": thrust}
+            )
         size = math.hypot(*message.q)
         if not (math.isfinite(size) and size > 0.5):
             raise ValueError("expected a quaternion of length one")
@@ -136,8 +142,8 @@ class Offboard:
         orientation, heading = (w, x, y, z), yaw_of((w, x, y, z))
         if turn := rates[2]:
             if self._turned is not None:
-                then, heading = self._turned
-                heading += turn * (now - then) / SECOND
+                before, heading = self._turned
+                heading += turn * (now - before) / SECOND
             self._turned = now, heading
             level = multiply(inverse(from_yaw(yaw_of(orientation))), orientation)
             orientation = multiply(from_yaw(heading), level)
@@ -145,11 +151,11 @@ class Offboard:
             self._turned = None
         dropped = "roll and pitch rates beside an attitude" if any(rates[:2]) else ""
         fields = {"orientation": orientation, "thrust": thrust}
-        return Made(ev.AttitudeSetpoint, fields, bool(turn), dropped)
+        return ConvertedSetpoint(ev.AttitudeSetpoint, fields, bool(turn), dropped)
 
 
-def _given(values: tuple[float, ...], mask: int) -> tuple[float, ...]:
-    """Return numbers, NaN where a mask's bit is set; a `ValueError` for infinite ones."""
+def _unmasked(values: tuple[float, ...], mask: int) -> tuple[float, ...]:
+    """Return numbers, with NaN where a mask's bit is set; a `ValueError` for infinite ones."""
     if any(map(math.isinf, values)):
         raise ValueError("expected numbers, found infinite ones")
     return tuple(math.nan if mask >> bit & 1 else value for bit, value in enumerate(values))

@@ -105,8 +105,8 @@ class Vehicle:
     samples: int = 0
     progress: Callable[[], tuple[int, int, int, int]] = lambda: (0, 65535, 0, 0)
 
-    def note(self, pose: Odometry | PoseEstimate) -> None:
-        """Take note of the newest pose."""
+    def set_pose(self, pose: Odometry | PoseEstimate) -> None:
+        """Set the pose, and the velocity if known; the first pose is home."""
         self.stamp, self.position, self.orientation = pose.stamp, pose.position, pose.orientation
         if isinstance(pose, Odometry):
             self.velocity = rotate(pose.orientation, pose.linear_velocity)
@@ -116,14 +116,14 @@ class Vehicle:
         if self.home is None:
             self.home = self.position
 
-    def measure(self, sample: Sample) -> None:
-        """Take note of a sensor's newest sample."""
+    def add_sample(self, sample: Sample) -> None:
+        """Add a sensor's newest sample."""
         self.samples += 1
         self.measured[type(sample)] = self.samples, sample
 
     @property
     def ready(self) -> bool:
-        """Whether it knows where it is, and so can fly."""
+        """Return whether it has a pose, and so can fly."""
         return self.home is not None
 
     @property
@@ -146,7 +146,7 @@ class Vehicle:
         """Return a message's place in ``map``, metres; NaN means where the vehicle is.
 
         `x` and `y` are 1e-7 degrees in global frames, metres in the local one; `z` is an altitude,
-        or metres down. A `ValueError` says why nobody can fly there.
+        or metres down. A `ValueError` says why the place cannot be flown to.
         """
         if frame == mav.MAV_FRAME_LOCAL_NED:
             position = (x, y, z)
@@ -163,8 +163,8 @@ class Vehicle:
         else:
             raise ValueError(f"expected a local or global frame, found frame {frame}")
         north, east, down = (
-            own if math.isnan(value) else coordinate
-            for own, value, coordinate in zip(self.position, (x, y, z), position, strict=True)
+            current if math.isnan(value) else coordinate
+            for current, value, coordinate in zip(self.position, (x, y, z), position, strict=True)
         )
         if not all(abs(coordinate) <= FARTHEST for coordinate in (north, east, down)):
             raise ValueError(
@@ -208,11 +208,13 @@ def _heartbeat(v: Vehicle, _: int) -> Any:
 
 
 def _sys_status(v: Vehicle, _: int) -> Any:
-    there = _HEALTHY | (mav.MAV_SYS_STATUS_SENSOR_GPS if v.gps else 0)
-    there |= mav.MAV_SYS_STATUS_SENSOR_VISION_POSITION
-    health = there if v.ready else there & ~mav.MAV_SYS_STATUS_PREARM_CHECK
+    present = _HEALTHY | (mav.MAV_SYS_STATUS_SENSOR_GPS if v.gps else 0)
+    present |= mav.MAV_SYS_STATUS_SENSOR_VISION_POSITION
+    health = present if v.ready else present & ~mav.MAV_SYS_STATUS_PREARM_CHECK
     health |= mav.MAV_SYS_STATUS_GEOFENCE  # not there; MAVProxy takes an unhealthy one for a breach
-    return mav.MAVLink_sys_status_message(there, there, health, 0, 16200, -1, 100, 0, 0, 0, 0, 0, 0)
+    return mav.MAVLink_sys_status_message(
+        present, present, health, 0, 16200, -1, 100, 0, 0, 0, 0, 0, 0
+    )
 
 
 def _system_time(v: Vehicle, ms: int) -> Any:  # noqa: ARG001
@@ -412,8 +414,8 @@ class Timer:
     due: int = 0
     since: int = 0
 
-    def take(self, now: int) -> bool:
-        """Return whether it is due; then it is due again a period later, not sooner after a gap."""
+    def pop_due(self, now: int) -> bool:
+        """Return whether it is due, and set the next time; after a gap, a period from now."""
         if now < self.due:
             return False
         self.due = (self.due if now - self.due < self.period else now) + self.period
@@ -423,18 +425,18 @@ class Timer:
 class Telemetry:
     """Sends messages to each peer at the rates that this peer has asked for."""
 
-    def __init__(self, vehicle: Vehicle, links: Links, tell: Callable[[str], None]) -> None:
-        self._vehicle, self._links, self._tell = vehicle, links, tell
+    def __init__(self, vehicle: Vehicle, links: Links, report: Callable[[str], None]) -> None:
+        self._vehicle, self._links, self._report = vehicle, links, report
         self._timers: WeakKeyDictionary[Peer, dict[int, Timer]] = WeakKeyDictionary()
         request, version = self._request, mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION
         home = mav.MAVLINK_MSG_ID_HOME_POSITION
         self._commands: dict[int, Callable[[Peer, Any, int], bool]] = {
             mav.MAV_CMD_SET_MESSAGE_INTERVAL: lambda peer, m, _: (
-                self._is_there(m.param1) and self.set_period(peer, m.param1, m.param2)
+                self._is_available(m.param1) and self.set_period(peer, m.param1, m.param2)
             ),
-            mav.MAV_CMD_GET_MESSAGE_INTERVAL: lambda peer, m, _: self._tell_period(peer, m.param1),
+            mav.MAV_CMD_GET_MESSAGE_INTERVAL: lambda peer, m, _: self._send_period(peer, m.param1),
             mav.MAV_CMD_REQUEST_MESSAGE: lambda peer, m, now: (
-                self._tell_period(peer, m.param2)
+                self._send_period(peer, m.param2)
                 if m.param1 == mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL
                 else request(peer, m.param1, now)
             ),
@@ -446,50 +448,50 @@ class Telemetry:
 
     def command(self, peer: Peer, message: Any, now: int) -> int | None:
         """Carry out a command about messages; return its ``MAV_RESULT``, `None` for others."""
-        if (do := self._commands.get(message.command)) is None:
+        if (handler := self._commands.get(message.command)) is None:
             return None
-        done = do(peer, message, now)
+        done = handler(peer, message, now)
         return int(mav.MAV_RESULT_ACCEPTED if done else mav.MAV_RESULT_UNSUPPORTED)
 
     def set_period(self, peer: Peer, number: float, microseconds: float) -> bool:
         """Set a message's period; 0 its own, below never; `False` if there is no such message."""
         if number not in TELEMETRY or not math.isfinite(microseconds):
             return False
-        own, timers = TELEMETRY[int(number)][0], self._of(peer)
-        if microseconds < 0 or (microseconds == 0 and not own):
+        usual_rate, timers = TELEMETRY[int(number)][0], self._timers_of(peer)
+        if microseconds < 0 or (microseconds == 0 and not usual_rate):
             timers.pop(int(number), None)
             return True
-        period = round(microseconds * 1e3 if microseconds else SECOND / own)
+        period = round(microseconds * 1e3 if microseconds else SECOND / usual_rate)
         if period < LEAST_PERIOD:
             name = getattr(mav.mavlink_map.get(number), "msgname", f"message {number:g}")
-            self._tell(f"{name}: expected at most {RATE:g} Hz, which now comes")
+            self._report(f"{name}: expected at most {RATE:g} Hz, which now comes")
             period = LEAST_PERIOD
         timers.setdefault(int(number), Timer(period)).period = period
         return True
 
     def set_stream(self, peer: Peer, stream: int, hertz: int) -> bool:
         """Set the rates of a stream's messages; `False` if it has none."""
-        numbers = [n for n in STREAMS.get(stream, ()) if not self._lacks(n)]
+        numbers = [n for n in STREAMS.get(stream, ()) if not self._unavailability(n)]
         for number in numbers:
             self.set_period(peer, number, 1e6 / hertz if hertz else -1)
         return bool(numbers)
 
     def update(self, now: int) -> None:
         """Send all that is due at a stamp (ns)."""
-        made: dict[tuple[int, int], Any] = {}
+        messages: dict[tuple[int, int], Any] = {}
         for peer in [*self._links.peers]:
-            for number, timer in self._of(peer).items():
-                if not timer.take(now):
+            for number, timer in self._timers_of(peer).items():
+                if not timer.pop_due(now):
                     continue
                 key = number, timer.since
-                if key not in made:
-                    made[key] = self._make(*key, now)
-                if made[key] is not None:
-                    self._links.send_to(peer, made[key])
+                if key not in messages:
+                    messages[key] = self._make(*key, now)
+                if messages[key] is not None:
+                    self._links.send_to(peer, messages[key])
                 if number == _HIGHRES_IMU:
                     timer.since = self._vehicle.samples
 
-    def _of(self, peer: Peer) -> dict[int, Timer]:
+    def _timers_of(self, peer: Peer) -> dict[int, Timer]:
         if (timers := self._timers.get(peer)) is None:
             rates = {number: hz for number, (hz, _) in TELEMETRY.items() if hz}
             timers = {number: Timer(round(SECOND / hz)) for number, hz in rates.items()}
@@ -501,19 +503,19 @@ class Telemetry:
             return _highres_imu(self._vehicle, since)
         return TELEMETRY[number][1](self._vehicle, now // 1_000_000 % 2**32)
 
-    def _lacks(self, number: float) -> str:
-        """Return why a message never comes, if so."""
+    def _unavailability(self, number: float) -> str:
+        """Return why a message can never be sent; empty if it can."""
         if number == _HIGHRES_IMU and self._vehicle.imu_orientation is None:
             return "HIGHRES_IMU: expected a vehicle with an IMU, found none"
         if number == _EKF_STATUS_REPORT and not self._vehicle.is_copter:
             return "EKF_STATUS_REPORT: it is ArduPilot's"
         return ""
 
-    def _is_there(self, number: float) -> bool:
-        """Tell why a message never comes, if so; return whether it may."""
-        if words := self._lacks(number):
-            self._tell(words)
-        return not words
+    def _is_available(self, number: float) -> bool:
+        """Return whether a message can be sent; report the reason if not."""
+        if reason := self._unavailability(number):
+            self._report(reason)
+        return not reason
 
     def _request(self, peer: Peer, number: float, now: int) -> bool:
         message = self._make(int(number), 0, now) if number in TELEMETRY else None
@@ -521,10 +523,10 @@ class Telemetry:
             self._links.send_to(peer, message)
         return message is not None
 
-    def _tell_period(self, peer: Peer, number: float) -> bool:
+    def _send_period(self, peer: Peer, number: float) -> bool:
         if not (math.isfinite(number) and 0 <= number <= 65535):
             return False
-        timer = self._of(peer).get(int(number))
+        timer = self._timers_of(peer).get(int(number))
         period = 0 if number not in TELEMETRY else timer.period // 1000 if timer else -1
         self._links.send_to(peer, mav.MAVLink_message_interval_message(int(number), period))
         return True
@@ -546,51 +548,51 @@ class Parameters(dict[str, float]):
     they came, but have no effect.
     """
 
-    def __init__(self, send: Callable[[Any], None], tell: Callable[[str], None]) -> None:
+    def __init__(self, send: Callable[[Any], None], report: Callable[[str], None]) -> None:
         super().__init__({name: value for name, (value, *_) in PARAMETERS.items()})
-        self._send, self._tell = send, tell
+        self._send, self._report = send, report
         self._inert: dict[str, tuple[float, int]] = {}  # value as sent, and its type
 
-    def hear(self, message: Any, sender: Sender) -> str | None:
+    def handle(self, message: Any, sender: Sender) -> str | None:
         """Answer a request of the parameter protocol; return what is wrong with it, if so."""
         kind, names = message.get_type(), [*self, *self._inert]
         if kind == "PARAM_REQUEST_LIST":
             for name in names:
-                self._give(name)
+                self._send_parameter(name)
             return None
         if kind == "PARAM_REQUEST_READ" and message.param_index >= 0:
             if message.param_index >= len(names):
-                self._deny(sender, "", message.param_index)
+                self._send_error(sender, "", message.param_index)
                 return f"parameter {message.param_index} is unknown here"
-            self._give(names[message.param_index])
+            self._send_parameter(names[message.param_index])
             return None
         name = message.param_id.rstrip("\0")
-        words = None
+        warning = None
         if kind == "PARAM_SET" and name.startswith(INERT) and len(self._inert) < MOST_INERT:
             if name not in self._inert:
-                words = f"{name} is kept, but nothing here is set by it"
+                warning = f"{name} is kept, but nothing here is set by it"
             self._inert[name] = message.param_value, message.param_type
         elif kind == "PARAM_SET" and name in self:
             _, least, most = PARAMETERS[name]
             if message.param_type != mav.MAV_PARAM_TYPE_REAL32:
-                self._tell(f"{name}: expected a REAL32, found type {message.param_type}")
+                self._report(f"{name}: expected a REAL32, found type {message.param_type}")
             elif least <= message.param_value <= most:
                 self[name] = message.param_value
             else:
-                self._tell(f"{name}: expected {least:g} to {most:g}")
+                self._report(f"{name}: expected {least:g} to {most:g}")
         if name not in self and name not in self._inert:
-            self._deny(sender, name, -1)
+            self._send_error(sender, name, -1)
             return f"parameter {name} is unknown here"
-        self._give(name)
-        return words
+        self._send_parameter(name)
+        return warning
 
-    def _deny(self, sender: Sender, name: str, index: int) -> None:
-        """Say that there is no such parameter, so that nobody asks again and again."""
+    def _send_error(self, sender: Sender, name: str, index: int) -> None:
+        """Answer that there is no such parameter, so that programs stop asking."""
         if hasattr(mav, "MAVLink_param_error_message"):  # older dialects have no such message
             unknown = mav.MAV_PARAM_ERROR_DOES_NOT_EXIST
             self._send(mav.MAVLink_param_error_message(*sender, name.encode(), index, unknown))
 
-    def _give(self, name: str) -> None:
+    def _send_parameter(self, name: str) -> None:
         real, names = mav.MAV_PARAM_TYPE_REAL32, [*self, *self._inert]
         value, kind = self._inert.get(name) or (self[name], real)
         self._send(

@@ -33,7 +33,7 @@ _HERE: Vector3 = (0.0, 0.0, 0.0)
 
 
 class RefusedPoseError(ValueError):
-    """A pose that is not taken; its sender is told why unless the words are empty.
+    """A pose is refused; its sender gets the reason unless the message is empty.
 
     Attributes:
         reason: In a word or two, by which such poses are counted.
@@ -72,10 +72,10 @@ class Source:
         has_poses: Whether it sends poses, so that differences are not integrated besides.
         last: The sender's stamp (µs) of the last pose or difference; `None` before.
         stamped: The same of the last pose that got a stamp of our clock (ns): `newest`.
-        restarts: How often its differences began anew.
+        restarts: How often its differences started again.
         position: Sum of its differences; `orientation` as well.
         speed: Newest speed that no pose has.
-        spoke: When a speed came (ns).
+        speed_arrived_at: Arrival of the newest speed (ns).
         still_at: Where its velocity was zero first, if it always was.
         moves: Whether a velocity other than zero came.
     """
@@ -88,7 +88,7 @@ class Source:
     position: Vector3 = _HERE
     orientation: Quaternion = _LEVEL
     speed: Speed | None = None
-    spoke: int | None = None
+    speed_arrived_at: int | None = None
     waiting: WaitingPose | None = None
     still_at: Vector3 | None = None
     moves: bool = False
@@ -98,38 +98,38 @@ class Vision:
     """All poses from outside.
 
     Args:
-        see: Publishes a pose: its stamp and fields.
-        refuse: Says why messages of a kind and a sender have no effect.
-        tell: Says a sentence, the first time, to all programs and to the log.
+        publish_pose: Publishes a pose: its stamp and fields.
+        refuse: Reports why messages of a kind and a sender have no effect.
+        report_once: Sends a sentence, the first time, to all programs and to the log.
     """
 
     def __init__(
         self,
         clocks: Clocks,
-        see: Callable[..., None],
+        publish_pose: Callable[..., None],
         refuse: Callable[[str, Sender, str], None],
-        tell: Callable[[str], None],
+        report_once: Callable[[str], None],
     ) -> None:
         self._clocks = clocks
-        self._see, self._refuse, self._tell = see, refuse, tell
+        self._publish_pose, self._refuse, self._report_once = publish_pose, refuse, report_once
         self._sources: dict[Sender, Source] = {}
         self.refused: Counter[str] = Counter()
-        self._taken = self._restamped = self._moving = self._alone = 0
+        self._accepted = self._restamped = self._with_velocity = self._unmatched_speeds = 0
 
-    def hear(self, sender: Sender, message: Any, now: int) -> None:
-        """Publish a message's pose, or say why not."""
-        kind, source = message.get_type(), self._of(sender)
+    def handle(self, sender: Sender, message: Any, now: int) -> None:
+        """Publish a message's pose, or report why it is refused."""
+        kind, source = message.get_type(), self._source_of(sender)
         try:
             if kind == "VISION_SPEED_ESTIMATE":
-                self._hear_speed(sender, source, message, now)
+                self._handle_speed(sender, source, message, now)
             elif kind == "VISION_POSITION_DELTA":
-                self._hear_delta(sender, source, message, now)
+                self._handle_delta(sender, source, message, now)
             else:
-                self._hear_pose(sender, source, message, now)
+                self._handle_pose(sender, source, message, now)
         except RefusedPoseError as refusal:
             self.refused[refusal.reason] += 1
-            if words := str(refusal):
-                self._refuse(kind, sender, words)
+            if reason := str(refusal):
+                self._refuse(kind, sender, reason)
 
     def update(self, now: int) -> None:
         """Publish poses whose speeds do not come."""
@@ -138,26 +138,28 @@ class Vision:
                 self._release(source)
 
     def summary(self) -> str:
-        """Return in a sentence how many poses were taken and refused, and why."""
+        """Return in a sentence how many poses were accepted and refused, and why."""
         for source in self._sources.values():
             self._release(source)
         notes = [f"{self._restamped} restamped"] if self._restamped else []
-        if self._taken and (delay := self._clocks.delay):
+        if self._accepted and (delay := self._clocks.delay):
             notes.append(f"each {delay / 1e6:g} ms earlier by delay")
-        notes += [f"{self._moving} with a velocity"] if self._moving else []
-        text = f"{self._taken} {'pose' if self._taken == 1 else 'poses'} taken"
+        notes += [f"{self._with_velocity} with a velocity"] if self._with_velocity else []
+        text = f"{self._accepted} {'pose' if self._accepted == 1 else 'poses'} taken"
         text += f" ({', '.join(notes)})" if notes else ""
         if refused := self.refused.total():
             reasons = ", ".join(f"{n} {reason}" for reason, n in self.refused.most_common())
             text += f", {refused} refused: {reasons}"
-        return text + (f"; {self._alone} speeds without a pose" if self._alone else "")
+        return text + (
+            f"; {self._unmatched_speeds} speeds without a pose" if self._unmatched_speeds else ""
+        )
 
-    def _hear_pose(self, sender: Sender, source: Source, message: Any, now: int) -> None:
+    def _handle_pose(self, sender: Sender, source: Source, message: Any, now: int) -> None:
         kind = message.get_type()
         if kind == "ODOMETRY":
             if message.frame_id not in _LOCAL:
-                words = f"expected frame_id LOCAL_NED or LOCAL_FRD, found {message.frame_id}"
-                raise RefusedPoseError("frame_id", words)
+                reason = f"expected frame_id LOCAL_NED or LOCAL_FRD, found {message.frame_id}"
+                raise RefusedPoseError("frame_id", reason)
             if getattr(message, "quality", 0) < 0:
                 raise RefusedPoseError("quality", "its quality says failed; others are judged")
         if kind in {"ODOMETRY", "ATT_POS_MOCAP"}:
@@ -208,48 +210,48 @@ class Vision:
         elif not source.moves:
             source.still_at = source.still_at or position
             if math.dist(source.still_at, position) > MOVED:
-                words = "is zero while it moves, and so judged: send NaN if it is unknown"
-                self._tell("velocity in ODOMETRY of {}/{} {}".format(*sender, words))
+                reason = "is zero while it moves, and so judged: send NaN if it is unknown"
+                self._report_once("velocity in ODOMETRY of {}/{} {}".format(*sender, reason))
                 source.moves = True
         return rotate(orientation, velocity) if frame in _BODY else velocity
 
-    def _hear_speed(self, sender: Sender, source: Source, message: Any, now: int) -> None:
-        """Join a speed to the pose that waits for it, or else keep it for the next one."""
+    def _handle_speed(self, sender: Sender, source: Source, message: Any, now: int) -> None:
+        """Join a speed to the pose that waits for it, or else store it for the next one."""
         kind, velocity = message.get_type(), (message.x, message.y, message.z)
         if not all(map(math.isfinite, velocity)):
             self._refuse(kind, sender, "its numbers are none; others are judged")
             return
-        source.spoke = now
+        source.speed_arrived_at = now
         waiting, before = source.waiting, source.speed
         if waiting is not None and waiting.stamp == message.usec:
             self._release(source, velocity)
             return
         source.speed = Speed(message.usec, velocity, message.usec == source.last)
         if before is not None and not before.is_late:
-            self._alone += 1
-            words = "expected a pose of the same usec beside it, such as VISION_POSITION_ESTIMATE"
-            self._refuse(kind, sender, f"{words}; ODOMETRY has both in one")
+            self._unmatched_speeds += 1
+            reason = "expected a pose of the same usec beside it, such as VISION_POSITION_ESTIMATE"
+            self._refuse(kind, sender, f"{reason}; ODOMETRY has both in one")
 
-    def _hear_delta(self, sender: Sender, source: Source, message: Any, now: int) -> None:
+    def _handle_delta(self, sender: Sender, source: Source, message: Any, now: int) -> None:
         """Add a difference to those before; the first after a gap is a new frame's origin."""
-        turn, way = message.angle_delta, message.position_delta
+        turn, shift = message.angle_delta, message.position_delta
         if source.has_poses:
             raise RefusedPoseError(
                 "differences beside poses", "poses of its sender are judged instead"
             )
-        if not all(map(math.isfinite, (*turn, *way))):
+        if not all(map(math.isfinite, (*turn, *shift))):
             raise RefusedPoseError("not a number", "its numbers are none; others are judged")
         stamp, period = message.time_usec, message.time_delta_usec
         before, source.last = source.last, stamp
         if before is None or not 2 * abs(stamp - period - before) <= max(period, 2000):
             if before is not None and source.position != _HERE:
                 source.restarts += 1
-                words = "a difference before it is missing: those after it are in another frame"
-                self._refuse(message.get_type(), sender, words)
+                reason = "a difference before it is missing: those after it are in another frame"
+                self._refuse(message.get_type(), sender, reason)
             source.position, source.orientation = _HERE, _LEVEL
             return
         source.orientation = normalize(multiply(source.orientation, _turned(turn)))
-        x, y, z = rotate(source.orientation, (way[0], way[1], way[2]))
+        x, y, z = rotate(source.orientation, (shift[0], shift[1], shift[2]))
         source.position = source.position[0] + x, source.position[1] + y, source.position[2] + z
         fields = {
             "stamp": self._stamp(sender, source, stamp, now),
@@ -282,25 +284,27 @@ class Vision:
         velocity: Vector3 | None,
         now: int,
     ) -> None:
-        """Publish a pose with the speed of its stamp, or let it wait for that."""
+        """Publish a pose with the speed of its stamp, or store it until that arrives."""
         self._release(source)
         source.last = stamp
         if velocity is None and source.speed is not None and source.speed.stamp == stamp:
             velocity, source.speed = source.speed.velocity, None
         source.waiting = WaitingPose(stamp, now, fields)
-        has_speeds = source.spoke is not None and now - source.spoke < SPEEDS_END
+        has_speeds = (
+            source.speed_arrived_at is not None and now - source.speed_arrived_at < SPEEDS_END
+        )
         if velocity is not None or not has_speeds:
             self._release(source, velocity)
 
     def _release(self, source: Source, velocity: Vector3 | None = None) -> None:
-        """Publish the pose that waits."""
+        """Publish the stored pose."""
         waiting, source.waiting = source.waiting, None
         if waiting is not None:
-            self._taken += 1
-            self._moving += velocity is not None
-            self._see(**waiting.fields, velocity=velocity)
+            self._accepted += 1
+            self._with_velocity += velocity is not None
+            self._publish_pose(**waiting.fields, velocity=velocity)
 
-    def _of(self, sender: Sender) -> Source:
+    def _source_of(self, sender: Sender) -> Source:
         if sender not in self._sources and len(self._sources) >= MOST_CLOCKS:
             self._sources.clear()
         return self._sources.setdefault(sender, Source())
