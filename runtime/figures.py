@@ -176,6 +176,7 @@ _TABLE = (
     _detail("method", "what the estimator says that it is"),
     _detail("vehicle", "vehicle by which it was judged"),
     Figure("alignment", "how it was laid on the truth", report="head"),
+    _detail("compared_at", "camera at which it is compared, instead of the body"),
     _detail("scale", "by what Sim(3) multiplies its lengths; 1 is right if they are in metres"),
     _detail("estimates", "poses that count"),
     _detail("compared", "poses for whose time a true pose is known"),

@@ -370,8 +370,11 @@ class Evaluation(Node[EvaluationConfig]):
             read = self._read_by(name, how)
             camera = choose_camera(seen, poses, read)
             body = self._flights.get(vehicle, Flight()).body
+            at_camera = {}
             if record.scale_free and {"grey", "rgb"} & {*record.reads}:  # and knows its camera
-                record.lever = self._place_of_camera(name, read, how)
+                eye = self._camera_of_poses(name, read, how)
+                record.lever = self._places.get(eye, record.lever)
+                at_camera = {"compared_at": eye} if any(record.lever) else {}
             judgement = self._judge(
                 name,
                 record,
@@ -381,7 +384,7 @@ class Evaluation(Node[EvaluationConfig]):
                 planned=planned_end(how),
                 body=body,
             )
-            judgement.figures.update(flown.get(vehicle, {}))
+            judgement.figures.update(flown.get(vehicle, {}) | at_camera)
             if camera is not None:
                 judgement.figures["camera"] = camera
             eye = "" if camera is None else camera.removesuffix("/grey")
@@ -437,10 +440,8 @@ class Evaluation(Node[EvaluationConfig]):
         read = None if end is None else end.read.get(owner_of(estimator, end))
         return read or self._read.get(estimator, ())
 
-    def _place_of_camera(
-        self, estimator: str, read: Collection[str], end: RunEnd | None
-    ) -> Vector3:
-        """Return the place on the body of the camera whose poses an estimator gives.
+    def _camera_of_poses(self, estimator: str, read: Collection[str], end: RunEnd | None) -> str:
+        """Return the camera whose poses an estimator gives; empty if that is unknown.
 
         Of several that are read, it is the one in whose images features are tracked.
         """
@@ -448,7 +449,7 @@ class Evaluation(Node[EvaluationConfig]):
         if len(eyes) > 1:
             owner = estimator if end is None else owner_of(estimator, end)
             eyes &= {self._vehicles.camera_of(estimator) or self._vehicles.camera_of(owner)}
-        return self._places[eyes.pop()] if eyes else (0.0, 0.0, 0.0)
+        return eyes.pop() if eyes else ""
 
     def _add_commands(
         self,

@@ -14,11 +14,13 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import msgspec
 from scipy.spatial.transform import Rotation
 
+from events import Vector3
+from nodes.data.export import mounting
 from nodes.judging.readers.axes import AXES, UNDECLARED, Axes
 from nodes.judging.readers.columns import (
     POINTS,
@@ -35,6 +37,7 @@ from nodes.judging.readers.columns import (
     stamps_of,
 )
 from nodes.judging.readers.source import (
+    NO_LEVER,
     Collected,
     Options,
     Reader,
@@ -43,6 +46,7 @@ from nodes.judging.readers.source import (
     decimal_commas,
 )
 from nodes.trajectory_files import Row, read_kitti, read_rows
+from runtime.source_files import source_file
 
 FORMATS = (
     "a trajectory: rows under a header that names the columns, or of TUM (8 fields with blanks "
@@ -141,7 +145,31 @@ def _read_ours(path: Path, _: Options) -> Source:
         poses,
         axes=Axes("nwu" if world_up else "ned", "frd"),
         frame_id=match[1] or match[2] or "",
+        lever=_lever(path),
     )
+
+
+class _Verdict(msgspec.Struct):
+    """What is used of a run's ``evaluation/verdict.json``."""
+
+    estimators: dict[str, dict[str, Any]] = {}
+
+
+def _lever(path: Path) -> Vector3:
+    """Return the lever with which a run has judged the estimator that one of its files is of."""
+    run = path.parent.parent
+    verdict = run / "evaluation" / "verdict.json"
+    if path.parent.name != "trajectories" or not verdict.is_file():
+        return NO_LEVER
+    try:
+        rows = msgspec.json.decode(verdict.read_bytes(), type=_Verdict).estimators.items()
+        eyes = (row.get("compared_at") for name, row in rows if source_file(name) == path.stem)
+        if not (eye := next(eyes, None)):
+            return NO_LEVER
+        x, y, z = mounting(run, eye)[:3, 3].tolist()
+    except (ValueError, OSError):  # the folder is damaged, but the poses may be whole
+        return NO_LEVER
+    return x, y, z
 
 
 _AIRSIM = {"timestamp", "pos_x", "pos_y", "pos_z", "q_w", "q_x", "q_y", "q_z"}

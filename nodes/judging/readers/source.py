@@ -25,6 +25,7 @@ Floats = npt.NDArray[np.float64]
 _TOO_LATE = 1 << 63  # first number of nanoseconds beyond 64 bits
 _BLANKS = " \r\n\v\f"  # without tabs
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
+NO_LEVER = (0.0, 0.0, 0.0)
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True):
@@ -57,7 +58,7 @@ class Source(msgspec.Struct, frozen=True, eq=False, kw_only=True):
         covariances: Of the poses, in ROS's order (x, y, z, and angles about the frame's fixed
             axes), shape (n, 6, 6); NaN for poses without one.
         velocities: In the poses' frame (m/s), shape (n, 3); NaN for poses without one.
-        lever: Place on the body (m) of the camera whose poses were given; see `of_body`.
+        lever: Place on the body (m) of the camera whose poses these were, or are judged as.
     """
 
     name: str
@@ -71,7 +72,7 @@ class Source(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     notes: tuple[str, ...] = ()
     covariances: Floats | None = None
     velocities: Floats | None = None
-    lever: Vector3 = (0.0, 0.0, 0.0)
+    lever: Vector3 = NO_LEVER
 
 
 class Start(msgspec.Struct, frozen=True):

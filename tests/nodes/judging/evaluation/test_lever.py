@@ -21,7 +21,9 @@ from events import (
 )
 from events.geometry import pose_matrix
 from nodes.estimators import Mount, TrackingResult
+from nodes.judging import judgement
 from nodes.judging.evaluation import Evaluation
+from nodes.judging.readers import read, read_truth
 from nodes.trajectory_files import read_tum
 from runtime.testing import run_nodes, spec
 from tests.nodes.judging.evaluation.flights import MS, SECOND, announced, place
@@ -154,9 +156,27 @@ def test_what_is_written_is_the_body(tmp_path: Path) -> None:
         assert abs(body.positions - there).max() < 1e-5
 
 
+def test_a_file_of_the_run_is_judged_as_in_the_run(tmp_path: Path) -> None:
+    said, sent = as_sent(("grey",))
+    assert judged(tmp_path, said, truth(10), sent)["compared_at"] == "drone/eye"
+    announcements = [{"type": "CameraAnnouncement", **msgspec.to_builtins(said[1])}]
+    (tmp_path / "summary.json").write_text(json.dumps({"announcements": announcements}))
+    folder = tmp_path / "trajectories"
+    source, true = read(str(folder / "est.tum")), read_truth(str(folder / "truth.tum"))
+    config = judgement.JudgeConfig(scale_free=True)
+    _, judgements, _, _ = judgement.judge_all(true, [source], None, config)
+    assert judgements["est"].figures["ate_rmse_m"] < 1e-5
+
+
 def test_who_does_not_say_what_it_reads_is_judged_as_the_body(tmp_path: Path) -> None:
     said, sent = as_sent(())  # such as a bridge: nobody knows what its poses are those of
     assert judged(tmp_path, said, truth(10), sent)["ate_rmse_m"] > 0.05
+
+
+def test_at_the_origin_of_the_body_nothing_is_said(tmp_path: Path) -> None:
+    said, sent = as_sent(("grey",))
+    said[1] = msgspec.structs.replace(said[1], position=(0.0, 0.0, 0.0))
+    assert "compared_at" not in judged(tmp_path, said, truth(10), sent)
 
 
 def test_metres_are_judged_at_the_body(tmp_path: Path) -> None:
