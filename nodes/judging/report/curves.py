@@ -79,12 +79,14 @@ def _shade(run: Run, axis: Any) -> None:
 
 
 def _known(run: Run) -> list[tuple[Estimator, Trajectory, Trajectory]]:
+    """Return estimators with poses of the point compared, and the true ones at their stamps."""
     known = []
     for estimator in run.estimators:
         truth = run.truth_of(estimator)
         if estimator.aligned is not None and truth is not None:
             inside = estimator.aligned.take(truth.covers(estimator.aligned.stamps))
-            known.append((estimator, inside, truth.at(inside.stamps)))
+            at = run.lever_of(estimator)
+            known.append((estimator, inside.moved(at), truth.moved(at).at(inside.stamps)))
     return known
 
 

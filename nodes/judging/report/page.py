@@ -40,6 +40,7 @@ _QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 88]
 _ALIGNED = {
     "none": "in the truth's frame as it is",
     "origin": "laid on the truth at its first pose",
+    "posyaw": "laid on the truth by position and heading",
     "se3": "laid on the truth as a whole (SE3)",
     "sim3": "laid on the truth as a whole, with scale (Sim3)",
 }  # how estimates and the truth were brought together, in words
@@ -153,6 +154,8 @@ def _verdict(name: str, figures: dict[str, Any], color: str) -> dict[str, Any]:
     if passed is None and "why" in figures:
         failed = [figures["why"]]
     alignment = _ALIGNED.get(str(figures.get("alignment")), "")
+    if "compared_at" in figures:
+        alignment = f"{alignment}, compared at {figures['compared_at']}"
     vehicle = f"of {figures['vehicle']}" if "vehicle" in figures else ""
     return {
         "name": name,

@@ -114,6 +114,15 @@ class Run(msgspec.Struct, frozen=True, eq=False, kw_only=True):
         """Return the true poses of an estimator's vehicle."""
         return self.truths.get(str(estimator.figures.get("vehicle")), self.truth)
 
+    def lever_of(self, estimator: Estimator) -> tuple[float, float, float]:
+        """Return the place on the body (m) at which an estimator is compared."""
+        eye = estimator.figures.get("compared_at")
+        for announced in self.facts.announcements if eye else ():
+            if announced["type"] == "CameraAnnouncement" and announced["source"] == eye:
+                x, y, z = announced["position"]
+                return x, y, z
+        return 0.0, 0.0, 0.0
+
     @property
     def start(self) -> int:
         """Origin of times in the figures (ns): 0, or the first stamp if stamps are Unix time."""

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from nodes.judging.evaluation.record import Interval
 from nodes.judging.evaluation.thresholds import Thresholds
 from nodes.judging.report.clouds import Shown, View, paint
-from nodes.judging.report.curves import draw_latency
+from nodes.judging.report.curves import draw_axes, draw_latency
 from nodes.judging.report.folder import broken, gaps, holes, read_poses, read_run
+from nodes.judging.report.page import render
 from nodes.judging.report.tables import drawing, label, number
 from nodes.judging.report.trajectories import draw_trajectories
 from nodes.mapping import read_ply
 from nodes.trajectory import Trajectory
 from nodes.trajectory_files import read_tum, write_tum
-from tests.nodes.judging.report.folders import SECOND, evaluated, ply, recorded, walk
+from tests.nodes.judging.report.folders import SECOND, evaluated, ply, recorded, summary, walk
 
 
 def test_poses_are_read_as_the_strict_reader_reads_them(tmp_path: Path) -> None:
@@ -46,6 +49,27 @@ def test_what_holds_no_poses_is_an_error(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.tum").write_text(text)
     with pytest.raises(ValueError, match=r"."):
         read_poses(tmp_path / "a.tum")
+
+
+def test_errors_along_axes_are_those_of_the_point_compared(tmp_path: Path) -> None:
+    """Of a camera at its true place, on a body that is turned too far."""
+    truth, lever = walk(10), [0.2, -0.1, 0.3]
+    verdict = evaluated(tmp_path, truth, {"vo": recorded(truth)}, Thresholds())
+    verdict["estimators"]["vo"] |= {"compared_at": "drone/eye", "alignment": "sim3"}
+    (tmp_path / "evaluation" / "verdict.json").write_bytes(msgspec.json.encode(verdict))
+    eye = {"type": "CameraAnnouncement", "source": "drone/eye", "position": lever}
+    summary(tmp_path, verdict, announcements=[eye | {"source": "drone/other"}, eye])
+    turned = (Rotation.from_rotvec([0.0, 0.0, 0.3]) * truth.rotations()).as_quat(scalar_first=True)
+    camera = Trajectory(truth.stamps, truth.moved(lever).positions, turned)
+    write_tum(tmp_path / "evaluation" / "vo.aligned.tum", camera.moved([-x for x in lever]))
+    run = read_run(tmp_path)
+    with drawing():
+        plot = draw_axes(run)
+    assert plot is not None
+    lines = [line for axis in plot.figure.axes for line in axis.lines]
+    assert len(lines) == 3
+    assert max(np.nanmax(abs(np.asarray(line.get_ydata()))) for line in lines) < 1e-5
+    assert "with scale (Sim3), compared at drone/eye" in render(run, [], [], [])
 
 
 def test_gaps_are_where_no_pose_is_and_lines_break_there() -> None:
