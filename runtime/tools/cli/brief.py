@@ -131,28 +131,29 @@ def print_tables(summary: Summary) -> None:
 
 def print_lines(summary: Summary, folder: Path) -> None:
     """Print the results of a run in a few lines, failures first."""
-    _print_all(lines(summary, folder))
+    *words, places = lines(summary, folder)
+    print_words(words)
+    Console().print(places, highlight=False, soft_wrap=True)  # a path and a command, to be copied
 
 
 def print_verdict(verdict: Verdict) -> None:
     """Print each verdict, with its main figures, or the reasons for a failure."""
-    console = Console()
     for name, figures in verdict.estimators.items():
         reasons = "; ".join(str(reason) for reason in figures.get("failed", ()))
-        console.print(_heading(name, figures) + (f": {escape(reasons)}" if reasons else ""))
-        for line in _figures(figures):
-            console.print(f"  {escape(line)}", highlight=False, soft_wrap=True)
+        print_words([_heading(name, figures) + (f": {escape(reasons)}" if reasons else "")])
+        print_words(f"  {escape(line)}" for line in _figures(figures))
 
 
 def print_failures(summary: Summary) -> None:
     """Print a line for each estimator that failed, and nothing else."""
-    _print_all(_failures(summary))
+    print_words(_failures(summary))
 
 
-def _print_all(shown: Iterable[str]) -> None:
-    console = Console()
+def print_words(shown: Iterable[str], console: Console | None = None) -> None:
+    """Print lines with rich's markup: of a terminal wrapped between words, else as they are."""
+    console = console or Console()
     for line in shown:
-        console.print(line, highlight=False, soft_wrap=True)
+        console.print(line, highlight=False, soft_wrap=not console.is_terminal)
 
 
 def lines(summary: Summary, folder: Path) -> Iterator[str]:

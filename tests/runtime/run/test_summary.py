@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from rich.console import Console
 
 from events import (
     Announcement,
@@ -30,7 +32,7 @@ from runtime.run.summarise import command_line
 from runtime.summary import Summary, merged
 from runtime.testing import run_nodes, spec
 from runtime.time.clock import Tick
-from runtime.tools.cli.brief import run_tables
+from runtime.tools.cli.brief import print_words, run_tables
 from tests.runtime.samples import Diarist, Failing, Painter, Ping, Reader, Speaker
 
 
@@ -241,3 +243,17 @@ def test_the_code_of_estimators_is_told_as_it_was_when_the_run_began(tmp_path: P
     assert merged([summary, replace(summary, code={"other": "1"})], []).code.keys() == {
         *("tracker", "other")
     }
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_terminal_shows_whole_words_and_a_pipe_whole_lines(terminal: bool) -> None:
+    shown = StringIO()
+    console = Console(file=shown, force_terminal=terminal, width=40, color_system=None)
+    print_words(
+        ["[bold]a[/bold] not judged: the user ended the run before its plan was flown"], console
+    )
+    rows = shown.getvalue().splitlines()
+    assert " ".join(row.strip() for row in rows) == (
+        "a not judged: the user ended the run before its plan was flown"
+    )
+    assert len(rows) == (2 if terminal else 1)
