@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from events import (
+    CameraAnnouncement,
     EstimatorAnnouncement,
     Event,
     Image,
@@ -23,6 +24,7 @@ from events import (
     TrackedFeatures,
     TrackingLost,
     TrackingRegained,
+    Vector3,
 )
 from events.announcements import Vehicles
 from events.frames import rotate
@@ -87,12 +89,20 @@ class Estimator:
         silent = now - self.received_at
         return f"lost: silent for {silent / SECOND:.1f} s" if silent > GAP else "tracking"
 
-    def add(self, event: PoseEstimate, truth: Pose | None) -> None:
-        """Add an estimate's place, aligned at the first estimate if it is not in ``map``."""
+    def add(self, event: PoseEstimate, truth: Pose | None, camera: Vector3 = (0, 0, 0)) -> None:
+        """Add an estimate's place, aligned at the first estimate if it is not in ``map``.
+
+        Args:
+            camera: Place on the body (m) of the camera at which it is aligned, as in an
+                evaluation, if free of scale.
+        """
         north, east, _ = event.position
         if self.scale_free:
             if truth is not None:  # aligned when drawn
-                self.path.add(event.stamp, east, north, truth[0][1], truth[0][0])
+                x, y, _ = rotate(event.orientation, camera)
+                u, v, _ = rotate(truth[1], camera)
+                true = truth[0][1] + v, truth[0][0] + u
+                self.path.add(event.stamp, east + y, north + x, *true, v, u)
             return
         if event.frame_id != "map" and truth is not None:
             pose = event.position, event.orientation
@@ -105,10 +115,11 @@ class Estimator:
         """Return its path; if free of scale, aligned by the similarity that fits best."""
         if not self.scale_free or not self.path.points:
             return list(self.path.points)
-        estimated, true = (np.array(self.path.points) @ [[1, 0], [1j, 0], [0, 1], [0, 1j]]).T
+        rows = np.array(self.path.points)
+        estimated, true, lever = (rows[:, ::2] + 1j * rows[:, 1::2]).T
         centred = estimated - estimated.mean()
         factor = np.vdot(centred, true) / max(np.vdot(centred, centred).real, 1e-12)
-        aligned = factor * centred + true.mean()
+        aligned = factor * centred + true.mean() - lever
         return list(
             zip(aligned.real.round(3).tolist(), aligned.imag.round(3).tolist(), strict=True)
         )
@@ -169,7 +180,15 @@ class Measured:
         estimator.received_at = now = self._state.clock.now()
         estimator.latency = now - event.stamp
         if estimator.path.due(event.stamp):
-            estimator.add(event, self._truth(event))
+            estimator.add(event, self._truth(event), self._camera(event.source))
+
+    def _camera(self, estimator: str) -> Vector3:
+        """Return the place on the body of the camera in whose images it tracks features."""
+        eye = self._vehicles.camera_of(estimator)
+        for announced in self._state.announcements if eye else ():
+            if isinstance(announced, CameraAnnouncement) and announced.source == eye:
+                return announced.position
+        return 0.0, 0.0, 0.0
 
     def _truth(self, event: PoseEstimate) -> Pose | None:
         truths = self._truths.get(self._vehicles.of(event.source))

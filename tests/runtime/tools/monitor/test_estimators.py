@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 
 from events import (
+    Announcement,
+    CameraAnnouncement,
+    CameraInfo,
     EstimatorAnnouncement,
     Event,
     Image,
@@ -34,7 +37,8 @@ class Run:
     def __init__(self, **announced: Any) -> None:
         self.now = 0
         announcement = EstimatorAnnouncement(stamp=0, source="vo", method="x", **announced)
-        state = Mock(announcements=[announcement])
+        self.announcements: list[Announcement] = [announcement]
+        state = Mock(announcements=self.announcements)
         state.clock.now = lambda: self.now
         self.measured = Measured(state)
 
@@ -128,6 +132,38 @@ def test_an_estimate_is_laid_on_the_truth(
     assert [*paths] == ["drone: truth", "vo"]
     assert np.array(paths["vo"]) == pytest.approx(np.array(paths["drone: truth"]), abs=5e-3)
     assert paths["drone: truth"][0] == (4.0, 5.0)  # east, north
+
+
+def test_without_scale_it_is_laid_on_the_truth_at_its_camera() -> None:
+    """The body that it says is half a metre from a camera in a fifth of the truth's unit."""
+    run = Run(scale_free=True)
+    eye = CameraAnnouncement(
+        stamp=0,
+        source="drone/eye",
+        frame_id="eye",
+        parent_frame_id="base_link",
+        position=(0.5, 0.0, 0.0),
+        orientation=(1.0, 0.0, 0.0, 0.0),
+        images=("grey",),
+        info=CameraInfo.from_fov(64, 48, 1.5),
+        rate=10.0,
+        latency=0.0,
+    )
+    run.announcements.append(eye)
+    nothing, inliers = np.empty((0, 2), np.float32), np.empty(0, np.bool_)
+    features = TrackedFeatures(
+        stamp=0, source="vo", frame_id="eye", points=nothing, inliers=inliers
+    )
+    run.send(features)
+
+    def said(x: float, y: float, yaw: float) -> tuple[float, float, float]:
+        ahead = np.array([0.5 * math.cos(yaw), 0.5 * math.sin(yaw)])
+        north, east = 0.2 * (np.array([x, y]) + ahead) - ahead
+        return float(north), float(east), yaw
+
+    run.fly(3, said, frame_id="odom")
+    paths = run.measured.paths()
+    assert np.array(paths["vo"]) == pytest.approx(np.array(paths["drone: truth"]), abs=5e-3)
 
 
 def test_a_drift_is_seen() -> None:
