@@ -74,8 +74,8 @@ def test_a_hello_holds_for_one_pair_and_one_run_and_one_version(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     key = derive(b"secret", "run", "tour")
-    hello = hello_seal(key, "a", "b").put_on(0, b"hello")
-    assert hello_seal(key, "a", "b").take_off(0, hello) == b"hello"
+    hello = hello_seal(key, "a", "b").seal_message(0, b"hello")
+    assert hello_seal(key, "a", "b").unseal(0, hello) == b"hello"
     for other in (
         hello_seal(key, "b", "a"),
         hello_seal(key, "a", "c"),
@@ -83,17 +83,17 @@ def test_a_hello_holds_for_one_pair_and_one_run_and_one_version(
         hello_seal(derive(b"Secret", "run", "tour"), "a", "b"),
     ):
         with pytest.raises(ForgedError):
-            other.take_off(0, hello)
+            other.unseal(0, hello)
     monkeypatch.setattr(session, "VERSION", 99)
     with pytest.raises(PeerError, match="version 99"):
-        hello_seal(key, "a", "b").take_off(0, hello)
+        hello_seal(key, "a", "b").unseal(0, hello)
 
 
 def test_parts_of_a_key_do_not_run_together() -> None:
     assert derive(b"s", "ab", "c") != derive(b"s", "a", "bc")
-    assert Seal(derive(b"s", "a")).put_on(1, b"ab", b"c") != Seal(derive(b"s", "a")).put_on(
-        1, b"a", b"bc"
-    )
+    assert Seal(derive(b"s", "a")).seal_message(1, b"ab", b"c") != Seal(
+        derive(b"s", "a")
+    ).seal_message(1, b"a", b"bc")
 
 
 LONG = "correct horse battery"

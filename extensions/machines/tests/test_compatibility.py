@@ -9,7 +9,7 @@ import pytest
 
 from extensions.machines.tests.samples import Process, settings
 from runtime.errors import PeerError
-from visnav_machines.handshake import check_fits, what_all_share
+from visnav_machines.handshake import check_fits, shared_settings
 from visnav_machines.messages import Hello
 
 TWO: tuple[tuple[str, str, dict[str, Any]], ...] = (("asker", "Asker", {}), ("one", "Answerer", {}))
@@ -81,5 +81,5 @@ def test_how_each_process_gets_there_and_what_it_logs_may_differ() -> None:
     """Through a tunnel, say, or with other certificates."""
     here = settings(*TWO, log="debug", stall=0, shared=False)
     there = settings(*TWO, meet="tcp/10.0.0.1:4711", wait=1.0)
-    assert what_all_share(here) == what_all_share(there)
-    assert what_all_share(here) != what_all_share(settings(*TWO, seed=1))
+    assert shared_settings(here) == shared_settings(there)
+    assert shared_settings(here) != shared_settings(settings(*TWO, seed=1))

@@ -95,7 +95,7 @@ class End:
         self.id = name
         self._pair = pair
 
-    def put(self, other: str, message: bytes, payload: bytes) -> None:
+    def send(self, other: str, message: bytes, payload: bytes) -> None:
         assert payload == b""
         self._pair.said.append((other, message))
         self._pair.under_way[other].append(message)
@@ -209,7 +209,7 @@ def test_of_a_flood_of_strangers_few_are_remembered() -> None:
     async def example() -> None:
         pair = Pair()
         greeting = pair.greetings["asker"]
-        greeting._session.put = lambda *_: None  # type: ignore[method-assign]
+        greeting._session.send = lambda *_: None  # type: ignore[method-assign]
         for number in range(10_000):
             greeting.on_presence(f"stranger{number}", True)
             pair.ends["asker"]._receive(f"other{number}", b"\1" * 40, b"")

@@ -102,7 +102,7 @@ class Attacker(threading.Thread):
     def run(self) -> None:
         token, number = None, 0
         raw = [encode(sent) for sent in MESSAGES]
-        forged = [Seal(b"x" * 32).put_on(n, data) for data in raw for n in (0, 1, 50)]
+        forged = [Seal(b"x" * 32).seal_message(n, data) for data in raw for n in (0, 1, 50)]
         wrong = [b"", b"\xff" * 30, b"\1" + bytes(60), msgspec.msgpack.encode({"type": "Turn"})]
         while not self._over.wait(0.01):
             number += 1

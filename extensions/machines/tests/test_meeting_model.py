@@ -69,9 +69,9 @@ class Machine:
         self.heard = [known.source for known in await self.peers.announce({self.node: [offer]})]
         await self.steps.acquire()
         self.connect()
-        reference = await self.peers._start.begin()
+        reference = await self.peers._start.wait_for_first_update()
         assert self.peers._remote is not None
-        assert {*self.peers._remote._wanted} >= {m.number for m in self.membership.present()}
+        assert {*self.peers._remote._inputs} >= {m.number for m in self.membership.present()}
         assert reference is not None or not absent(self.membership)
         await self.steps.acquire()  # in real time there is a while to the first update
         lost = absent(self.membership)
@@ -89,7 +89,7 @@ class Machine:
     def stop(self, reason: str, *_: Any, **__: Any) -> None:
         raise AssertionError(reason)
 
-    def put(self, other: str, message: bytes, payload: bytes) -> None:
+    def send(self, other: str, message: bytes, payload: bytes) -> None:
         self._wire.under_way[self.id, other].append((message, payload))
 
 
@@ -195,7 +195,7 @@ def check(wire: Wire) -> None:
             f"{node} has not taken all back"
         )
         assert peers._remote is not None
-        wanted = peers._remote._wanted
+        wanted = peers._remote._inputs
         assert len(wanted) == 2
         assert all(wanted.values()), f"{node} does not know what others want"
 
@@ -254,7 +254,7 @@ def test_who_was_told_that_the_run_begins_waits_for_nobody_who_is_gone(
 ) -> None:
     """It may have stood still while the others began, and ended; the loss is one of the run."""
     membership: Any = SimpleNamespace(present=list, here=(), seats={}, waiting=Waiting({}, 1.0))
-    reference: Any = SimpleNamespace(over=over, begin=FirstUpdate(0, 0) if told else None)
+    reference: Any = SimpleNamespace(over=over, first_update=FirstUpdate(0, 0) if told else None)
     start = JointStart(membership, Still(), 1.0)  # type: ignore[arg-type]
     assert asyncio.run(start._decided(reference)) is begins
 

@@ -33,13 +33,13 @@ def sample_image(value: int = 0, side: int = 100) -> Image:
 
 def both() -> tuple[Outgoing, Incoming]:
     outgoing = Outgoing()
-    incoming = Incoming.found(outgoing.offer())
+    incoming = Incoming.open_offer(outgoing.offer())
     assert incoming is not None
     return outgoing, incoming
 
 
 def put(outgoing: Outgoing, event: Image) -> tuple[int, int]:
-    place = outgoing.put(pack(event))
+    place = outgoing.store(pack(event))
     assert place is not None
     return place
 
@@ -75,16 +75,16 @@ def test_there_is_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(member, "LIMIT", 100_000)
     outgoing, _ = both()
     packed = pack(sample_image())
-    assert [outgoing.put(packed) is None for _ in range(4)] == [False, False, True, True]
+    assert [outgoing.store(packed) is None for _ in range(4)] == [False, False, True, True]
 
 
 def test_who_is_elsewhere_or_finds_another_file_does_without(tmp_path: Path) -> None:
     offer = Outgoing().offer()
     outgoing = Outgoing()  # so that the first one's descriptor may be another's now
     gc.collect()
-    assert Incoming.found(offer) is None
+    assert Incoming.open_offer(offer) is None
     offer = outgoing.offer()
-    assert Incoming.found(offer) is not None
+    assert Incoming.open_offer(offer) is not None
     other = tmp_path / "other"
     other.write_bytes(offer.key)
     for wrong in (
@@ -96,7 +96,7 @@ def test_who_is_elsewhere_or_finds_another_file_does_without(tmp_path: Path) -> 
         {"path": "/dev/zero"},
         {"path": "/proc/1/fd/4711"},
     ):
-        assert Incoming.found(msgspec.structs.replace(offer, **wrong)) is None
+        assert Incoming.open_offer(msgspec.structs.replace(offer, **wrong)) is None
 
 
 def test_no_descriptor_is_left() -> None:
@@ -170,7 +170,7 @@ def test_a_line_puts_a_image_there_at_once_and_a_larger_one_in_its_thread() -> N
 
 
 def test_a_line_without_room_there_sends_the_frame_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Outgoing, "put", lambda self, packed: None)
+    monkeypatch.setattr(Outgoing, "store", lambda self, packed: None)
     line, said, _ = lined(Outgoing())
     packed = pack(sample_image(1))
     assert packed.size > SMALL
@@ -205,7 +205,7 @@ def test_what_cannot_be_put_into_memory_is_counted_all_the_same(
     def full(*_: Any) -> None:
         raise OSError("no space left")
 
-    monkeypatch.setattr(Outgoing, "put", full)
+    monkeypatch.setattr(Outgoing, "store", full)
     line, said, wrong = lined(Outgoing())
     line.send(EventMessage("a.b", 7), sample_image(1, side=LARGE))
     line.send(Ready())
@@ -228,13 +228,13 @@ def test_images_pass_through_it_if_the_file_says_so(
     shared: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     placed: list[int] = []
-    put = Outgoing.put
+    store = Outgoing.store
 
     def noted(outgoing: Outgoing, packed: Packed) -> tuple[int, int] | None:
         placed.append(packed.size)
-        return put(outgoing, packed)
+        return store(outgoing, packed)
 
-    monkeypatch.setattr(Outgoing, "put", noted)
+    monkeypatch.setattr(Outgoing, "store", noted)
     monkeypatch.setattr("visnav_machines.member.SMALL", 4096)  # less than an image of the sample
     config = settings(*THREE, shared=shared)
     one, other = apart(config, "asker", "one,other")

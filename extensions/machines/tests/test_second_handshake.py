@@ -59,7 +59,7 @@ def once(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str, At], threading.
 
     def arrange(who: str, point: str, call: At) -> threading.Event:
         reached = threading.Event()
-        say, meet, announce = JointStart.say, Membership.meet, JointStart.announce
+        send, meet, announce = JointStart.send, Membership.meet, JointStart.announce
 
         def reach(membership: Membership, here: str) -> None:
             if (membership.here, here) == ((who,), point) and not reached.is_set():
@@ -68,8 +68,8 @@ def once(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str, At], threading.
                 finally:
                     reached.set()
 
-        def say_and_reach(start: JointStart, message: Message) -> None:
-            say(start, message)
+        def send_and_reach(start: JointStart, message: Message) -> None:
+            send(start, message)
             reach(start._membership, type(message).__name__)
 
         async def meet_and_reach(membership: Membership) -> int:
@@ -82,7 +82,7 @@ def once(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str, At], threading.
             reach(start._membership, "heard")
             return heard
 
-        monkeypatch.setattr(JointStart, "say", say_and_reach)
+        monkeypatch.setattr(JointStart, "send", send_and_reach)
         monkeypatch.setattr(Membership, "meet", meet_and_reach)
         monkeypatch.setattr(JointStart, "announce", announce_and_reach)
         return reached
@@ -183,7 +183,7 @@ def test_who_comes_back_with_other_announcements_ends_the_run(
     config = settings(*THREE)
     died = once("asker", "heard", die)
     heard = threading.Event()
-    announce, hear = JointStart.announce, JointStart.hear
+    announce, record = JointStart.announce, JointStart.record_announcements
 
     async def announce_anew(start: JointStart, own: Any) -> Any:
         if died.is_set():
@@ -191,13 +191,13 @@ def test_who_comes_back_with_other_announcements_ends_the_run(
             own = {"asker": [Offer(stamp=0, source="asker", rate=49.0)]}
         return await announce(start, own)
 
-    def hear_it(start: JointStart, *heard_of: Any) -> None:
-        hear(start, *heard_of)
+    def record_and_notice(start: JointStart, *heard_of: Any) -> None:
+        record(start, *heard_of)
         if start._membership.here != ("asker",):
             heard.set()
 
     monkeypatch.setattr(JointStart, "announce", announce_anew)
-    monkeypatch.setattr(JointStart, "hear", hear_it)
+    monkeypatch.setattr(JointStart, "record_announcements", record_and_notice)
     others = [Process(config, "asker"), Process(config, "one,other")]
     assert died.wait(20)
     back = Process(config, "asker")

@@ -124,7 +124,7 @@ def apart(plan: Plan, owners: list[int], end: int, random: Random) -> list[tuple
         if pairs and random.random() < 0.5:
             sender, receiver = pair = random.choice(pairs)
             message, event = nodes.net[pair].popleft()
-            nodes.turns[receiver].take(sender, message, event)
+            nodes.turns[receiver].receive(sender, message, event)
             idle.clear()
             continue
         me = random.choice(everybody)

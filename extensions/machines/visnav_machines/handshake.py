@@ -59,7 +59,7 @@ class Group(Protocol):
     def joined(self, member: Member) -> None:
         """Handle the start of a session."""
 
-    def left(self, member: Member, why: str = ...) -> None:
+    def left(self, member: Member, reason: str = ...) -> None:
         """Handle the end of a session."""
 
     def unsent(self, name: str, error: VisnavError) -> None:
@@ -111,15 +111,15 @@ class Handshakes:
         with self._lock:
             return [c.member for c in self._contacts.values() if c.member is not None]
 
-    def on_presence(self, other: str, here: bool) -> None:
+    def on_presence(self, other: str, present: bool) -> None:
         """Handle the appearance or disappearance of a process."""
         with self._lock:
-            contact = self._contact(other) if here else self._contacts.pop(other, None)
-            if not here:
-                self._complained.add(other)  # its last words may come late
+            contact = self._contact(other) if present else self._contacts.pop(other, None)
+            if not present:
+                self._complained.add(other)  # its last messages may arrive late
         if contact is None:
             return
-        if here:
+        if present:
             self._membership.soon(self._greet_one, other, contact.nonce)
         elif contact.member is not None:
             self._membership.soon(self._membership.left, contact.member)
@@ -133,7 +133,7 @@ class Handshakes:
         """
         seal = hello_seal(self._key, sender, self._session.id)
         try:
-            hello = decode(seal.take_off(0, sealed))
+            hello = decode(seal.unseal(0, sealed))
         except ForgedError:
             raise
         except WireError as error:
@@ -164,17 +164,17 @@ class Handshakes:
             elif hello.session == before.sealing.tag:  # all is well, or it is an old one
                 contact.nonce = secrets.token_bytes(NONCE)  # answers on their way end no session
             elif hello.nonce == before.sealing.seen:  # ours did not get there
-                mine = before.sealing
-                soon(self._greet_one, sender, mine.nonce, mine.seen, mine.tag)
+                current = before.sealing
+                soon(self._greet_one, sender, current.nonce, current.seen, current.tag)
             else:
                 contact.doubt = hello.nonce
 
     def _member(self, sender: str, hello: Hello, sealing: Sealing) -> Member:
-        def put(message: bytes, payload: bytes) -> None:
-            self._session.put(sender, sealing.seal(message, payload), payload)
+        def write(message: bytes, payload: bytes) -> None:
+            self._session.send(sender, sealing.seal(message, payload), payload)
 
         failed = partial(self._membership.soon, self._membership.unsent, ", ".join(hello.nodes))
-        return Member(sender, hello, sealing, Outbox(sender, put, failed))
+        return Member(sender, hello, sealing, Outbox(sender, write, failed))
 
     def refuse(self, sender: str, error: VisnavError) -> None:
         """Log a process whose messages are refused: once each, for so many."""
@@ -191,7 +191,7 @@ class Handshakes:
             if contact is None or member is None:
                 return
             contact.member = None
-            self._complained.add(sender)  # its last words may come late
+            self._complained.add(sender)  # its last messages may arrive late
         self._membership.soon(
             self._membership.left, member, f"their process is not understood: {error}"
         )
@@ -218,7 +218,7 @@ class Handshakes:
         hello = msgspec.structs.replace(self._membership.hello, nonce=nonce, seen=seen, session=tag)
         seal = hello_seal(self._key, self._session.id, other)
         with contextlib.suppress(PeerError):  # the session is closed
-            self._session.put(other, seal.put_on(0, encode(hello)), b"")
+            self._session.send(other, seal.seal_message(0, encode(hello)), b"")
 
     def _contact(self, other: str) -> Contact | None:
         if other not in self._contacts:
@@ -228,7 +228,7 @@ class Handshakes:
         return self._contacts[other]
 
 
-def what_all_share(config: Config) -> dict[str, Any]:
+def shared_settings(config: Config) -> dict[str, Any]:
     """Return the settings common to all processes: no network, log, stall, or file folders."""
     table: dict[str, Any] = to_builtins(config)
     types = [spec.node.config_type for spec in config.nodes]
@@ -239,28 +239,28 @@ def what_all_share(config: Config) -> dict[str, Any]:
     }
 
 
-def check_fits(mine: Hello, other: Hello, nodes: Sequence[str]) -> None:
-    """Raise `PeerError` if another process has another file, nodes of ours, or left us out."""
-    if place := _difference(mine.config, other.config):
-        where, here, there = place
+def check_fits(local: Hello, remote: Hello, nodes: Sequence[str]) -> None:
+    """Raise `PeerError` if a process has another file or nodes of ours, or excludes us."""
+    if place := _difference(local.config, remote.config):
+        setting, local_value, remote_value = place
         raise PeerError(
-            f"expected the process at {other.place} to run the same file, found {where} = "
-            f"{there} there, {here} here"
+            f"expected the process at {remote.place} to run the same file, found {setting} = "
+            f"{remote_value} there, {local_value} here"
         )
-    if not other.nodes or not set(other.nodes) <= set(nodes):
+    if not remote.nodes or not set(remote.nodes) <= set(nodes):
         raise PeerError(
-            f"expected the process at {other.place} to run some of {', '.join(nodes)}, found "
-            f"{', '.join(other.nodes) or 'none'}"
+            f"expected the process at {remote.place} to run some of {', '.join(nodes)}, found "
+            f"{', '.join(remote.nodes) or 'none'}"
         )
-    if twice := set(mine.nodes) & set(other.nodes):
+    if twice := set(local.nodes) & set(remote.nodes):
         raise PeerError(
             f"expected each node to run in one process, found {_in_order(twice, nodes)} at "
-            f"{other.place}, too"
+            f"{remote.place}, too"
         )
-    if gone := set(mine.nodes) & set(other.left_out):
+    if excluded := set(local.nodes) & set(remote.left_out):
         raise PeerError(
             f"expected a run that waits for us, found that it goes on without "
-            f"{_in_order(gone, nodes)}"
+            f"{_in_order(excluded, nodes)}"
         )
 
 
@@ -268,21 +268,21 @@ def _in_order(members: set[str], nodes: Sequence[str]) -> str:
     return ", ".join(node for node in nodes if node in members)
 
 
-def _difference(mine: Any, other: Any, where: str = "") -> tuple[str, str, str] | None:
+def _difference(local: Any, remote: Any, path: str = "") -> tuple[str, str, str] | None:
     """Return the first place where two tables differ, and both values there."""
-    if isinstance(mine, Mapping) and isinstance(other, Mapping):
-        for key in dict.fromkeys([*mine, *other]):
-            if key not in mine or key not in other:
-                inside = f"{where}.{key}".strip(".")
-                return inside, *(show(t[key]) if key in t else "nothing" for t in (mine, other))  # type: ignore[return-value]
-            if difference := _difference(mine[key], other[key], f"{where}.{key}".strip(".")):
+    if isinstance(local, Mapping) and isinstance(remote, Mapping):
+        for key in dict.fromkeys([*local, *remote]):
+            if key not in local or key not in remote:
+                inside = f"{path}.{key}".strip(".")
+                return inside, *(show(t[key]) if key in t else "nothing" for t in (local, remote))  # type: ignore[return-value]
+            if difference := _difference(local[key], remote[key], f"{path}.{key}".strip(".")):
                 return difference
         return None
-    if isinstance(mine, list | tuple) and isinstance(other, list | tuple):
-        if len(mine) != len(other):
-            return where, f"{len(mine)} entries", f"{len(other)} entries"
-        for index, pair in enumerate(zip(mine, other, strict=True)):
-            if difference := _difference(*pair, f"{where}[{index}]"):
+    if isinstance(local, list | tuple) and isinstance(remote, list | tuple):
+        if len(local) != len(remote):
+            return path, f"{len(local)} entries", f"{len(remote)} entries"
+        for index, pair in enumerate(zip(local, remote, strict=True)):
+            if difference := _difference(*pair, f"{path}[{index}]"):
                 return difference
         return None
-    return None if mine == other else (where, show(mine), show(other))
+    return None if local == remote else (path, show(local), show(remote))

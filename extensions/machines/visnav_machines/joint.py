@@ -69,37 +69,37 @@ _PARTS = msgspec.json.Decoder(Summary)
 
 
 class JointStart:
-    """Our part in the start of a run."""
+    """Part of this process in the start of a run."""
 
     def __init__(self, membership: Membership, clock: Clock, startup_limit: float) -> None:
         self._membership = membership
         self._clock = clock
         self._startup_limit = startup_limit
-        self._said: dict[type[Message], Message] = {}
-        self._heard: dict[tuple[str, ...], Announcements] = {}
+        self._sent_messages: dict[type[Message], Message] = {}
+        self._announced: dict[tuple[str, ...], Announcements] = {}
 
-    async def announce(self, own: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
+    async def announce(self, local: Mapping[str, Iterable[Announcement]]) -> list[Announcement]:
         """Send the announcements of the nodes here; return those of all, in file order."""
-        self.say(
+        self.send(
             Announcements(
-                {name: tuple(bytes(pack(a).frame()) for a in sent) for name, sent in own.items()}
+                {name: tuple(bytes(pack(a).frame()) for a in sent) for name, sent in local.items()}
             )
         )
         membership = self._membership
         await self._until(
-            lambda: self._whole() and all(m.announced for m in membership.present()),
-            whom=lambda m: m.announced is None,
+            lambda: self._is_complete() and all(m.announced for m in membership.present()),
+            is_awaited=lambda m: m.announced is None,
         )
-        everything = dict(own)
+        announcements = dict(local)
         for member in membership.present():
             for name, frames in member.announced.by_node.items() if member.announced else ():
                 try:
-                    everything[name] = [_announcement(frame) for frame in frames]
+                    announcements[name] = [_announcement(frame) for frame in frames]
                 except WireError as error:
                     raise PeerError(f"{name}, at {member.place}: {error}") from None
-        return [a for name in membership.nodes for a in everything.get(name, ())]
+        return [a for name in membership.nodes for a in announcements.get(name, ())]
 
-    async def begin(self) -> Member | None:
+    async def wait_for_first_update(self) -> Member | None:
         """Agree with the others on the first update, wait for it, and return whose clock counts.
 
         A process that comes back to a run that goes on joins it where it is. `None` is this
@@ -107,24 +107,24 @@ class JointStart:
         """
         membership, lockstep = self._membership, isinstance(self._clock, LockstepClock)
         while True:
-            await self._until(self._whole, whom=lambda _: False)
+            await self._until(self._is_complete, is_awaited=lambda _: False)
             reference = self._reference()
             if reference is not None and not lockstep:
                 await reference.compare_clocks(membership.waiting.until)
-            self.say(Ready())
+            self.send(Ready())
             if await self._decided(reference):
                 break
         if reference is None:
             origin = time.monotonic_ns() + LEAD
         else:
-            assert reference.begin is not None
+            assert reference.first_update is not None
             best = reference.best()
-            origin = reference.begin.origin - (best.offset if best else 0)
+            origin = reference.first_update.origin - (best.offset if best else 0)
             if lockstep:
                 loop = asyncio.get_running_loop()
                 assert isinstance(loop, LockstepLoop)
-                loop.move(reference.begin.now, loop.orders())
-        self.say(FirstUpdate(origin, self._clock.now()))
+                loop.move(reference.first_update.now, loop.orders())
+        self.send(FirstUpdate(origin, self._clock.now()))
         if isinstance(self._clock, RealClock):
             await asyncio.sleep(max(origin - time.monotonic_ns(), 0) / 1e9)
             self._clock.start_at(origin)
@@ -139,41 +139,42 @@ class JointStart:
 
         if reference is None:
             await self._until(
-                lambda: self._reference() is not None or (self._whole() and ready()),
-                whom=lambda m: not m.ready,
+                lambda: self._reference() is not None or (self._is_complete() and ready()),
+                is_awaited=lambda m: not m.ready,
             )
             return self._reference() is None
 
-        def told() -> bool:
-            return reference.begin is not None and ready()
+        def has_begun() -> bool:
+            return reference.first_update is not None and ready()
 
         await self._until(
-            lambda: reference.over != "" or told(), whom=lambda m: not m.ready or m is reference
+            lambda: reference.over != "" or has_begun(),
+            is_awaited=lambda m: not m.ready or m is reference,
         )
-        return told()  # then the run has begun, even if the one that said so is gone since
+        return has_begun()  # then the run has begun, even if the one that said so is gone since
 
-    def say(self, message: Message) -> None:
+    def send(self, message: Message) -> None:
         """Send a message to all processes, and to those joining or returning later."""
-        if self._said.get(type(message)) != message:
-            self._said[type(message)] = message
+        if self._sent_messages.get(type(message)) != message:
+            self._sent_messages[type(message)] = message
             self._membership.broadcast(message)
 
-    def say_again(self, member: Member) -> None:
+    def resend(self, member: Member) -> None:
         """Send a process all messages of this process about the start."""
-        for _, message in sorted(self._said.items(), key=lambda item: item[0] is Ready):
+        for _, message in sorted(self._sent_messages.items(), key=lambda item: item[0] is Ready):
             member.outbox.send(message)
 
-    def over(self) -> None:
-        """Mark the start as over; processes arriving from now on are told so."""
-        del self._said[FirstUpdate]
-        self._said[Ready] = Ready(begun=True)
+    def mark_over(self) -> None:
+        """Mark the start as over, also for processes arriving from now on."""
+        del self._sent_messages[FirstUpdate]
+        self._sent_messages[Ready] = Ready(begun=True)
 
-    def hear(self, member: Member, message: Announcements) -> None:
+    def record_announcements(self, member: Member, message: Announcements) -> None:
         """Record a process's announcements, of its nodes only, or raise `WireError`."""
         if not message.by_node.keys() <= {*member.nodes}:
             raise WireError("expected announcements of its own nodes")
         member.announced = message
-        if self._heard.setdefault(member.nodes, message) != message:
+        if self._announced.setdefault(member.nodes, message) != message:
             self._membership.misfit(
                 PeerError(
                     f"expected {member.name}, which came back, to announce what it had "
@@ -181,16 +182,16 @@ class JointStart:
                 )
             )
 
-    def _whole(self) -> bool:
+    def _is_complete(self) -> bool:
         return self._membership.complete() or any(m.running for m in self._membership.present())
 
     async def _until(
-        self, condition: Callable[[], bool], *, whom: Callable[[Member], bool]
+        self, condition: Callable[[], bool], *, is_awaited: Callable[[Member], bool]
     ) -> None:
         membership = self._membership
         largest = max(map(len, [membership.here, *(s.nodes for s in membership.seats.values())]))
         limit = self._startup_limit * (largest + 1)
-        await membership.waiting.until(condition, whom=whom, limit=limit)
+        await membership.waiting.until(condition, is_awaited=is_awaited, limit=limit)
 
     def _reference(self) -> Member | None:
         present = self._membership.present()
@@ -207,10 +208,10 @@ def _announcement(frame: bytes) -> Announcement:
 
 
 class JointShutdown:
-    """Our part in the end of a run.
+    """Part of this process in the end of a run.
 
     Args:
-        on_timeout: Called when some are not waited for any more.
+        on_timeout: Called when the wait for some processes is given up.
 
     Attributes:
         at_work: Whether a node here is about to end.
@@ -226,13 +227,13 @@ class JointShutdown:
         self._timer: threading.Timer | None = None
         self._with_summary: dict[int, Member] = {}
 
-    def begin(self) -> None:
-        """Look from now on, in real time, whether the end goes on."""
+    def start_watching(self) -> None:
+        """Check repeatedly, in real time, that the others still end."""
         self.received_at = time.monotonic()
-        self._timer = call_after(BUSY_EVERY, asyncio.get_running_loop(), self._look)
+        self._timer = call_after(BUSY_EVERY, asyncio.get_running_loop(), self._check_silence)
 
     def close(self) -> None:
-        """Look no more."""
+        """Stop checking."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -242,15 +243,17 @@ class JointShutdown:
         membership = self._membership
         after = membership.nodes[membership.nodes.index(node) + 1 if node else 0 :]
 
-        def awaited(member: Member) -> bool:
+        def is_awaited_member(member: Member) -> bool:
             return not {*after}.isdisjoint({*member.nodes} - self.ended_nodes)
 
         await membership.waiting.until(
-            lambda: not any(map(awaited, membership.present())), despite=True, whom=awaited
+            lambda: not any(map(is_awaited_member, membership.present())),
+            despite=True,
+            is_awaited=is_awaited_member,
         )
         self.at_work = bool(node)
 
-    def hear(self, member: Member, message: FinalSummary) -> None:
+    def record_summary(self, member: Member, message: FinalSummary) -> None:
         """Record a process's part of the summary, and confirm it; or raise `WireError`."""
         try:
             member.final_summary = _PARTS.decode(message.part)
@@ -259,10 +262,10 @@ class JointShutdown:
         self._with_summary[member.number] = member
         member.outbox.send(SummaryReceived())
 
-    async def exchange_summaries(self, mine: Summary) -> Summary:
+    async def exchange_summaries(self, summary: Summary) -> Summary:
         """Exchange the processes' parts of the summary; return the merged summary."""
         membership = self._membership
-        membership.broadcast(FinalSummary(msgspec.json.encode(mine)))
+        membership.broadcast(FinalSummary(msgspec.json.encode(summary)))
         try:
             async with real_time_limit(PARTING):
                 await membership.waiting.until(
@@ -274,7 +277,7 @@ class JointShutdown:
         except TimeoutError:
             silent = [m.name for m in membership.present() if m.final_summary is None]
             log.warning("no summary of %s", "; ".join(silent))
-        parts = {membership.me: mine}
+        parts = {membership.me: summary}
         processes = {membership.me: ProcessSummary(list(membership.here), membership.hello.place)}
         for member in [*self._with_summary.values(), *membership.present()]:
             processes[member.number] = member.summary()
@@ -284,7 +287,7 @@ class JointShutdown:
             [part for _, part in sorted(parts.items())], [p for _, p in sorted(processes.items())]
         )
 
-    def _look(self) -> None:
+    def _check_silence(self) -> None:
         if self._timer is None:
             return
         membership = self._membership
@@ -300,4 +303,4 @@ class JointShutdown:
                 member.unfit, membership.seats[member.number].member = True, None
             self._on_timeout()
             membership.waiting.notify()
-        self._timer = call_after(BUSY_EVERY, asyncio.get_running_loop(), self._look)
+        self._timer = call_after(BUSY_EVERY, asyncio.get_running_loop(), self._check_silence)

@@ -78,10 +78,10 @@ class Member:
         lost_at: When it ended, on `time.monotonic`.
         running: Whether its first update was already, as far as is known.
         unfit: Whether it is no part of the run: it runs another file, or nodes that run elsewhere.
-        held: Messages it has sent, while another process with its nodes is still in the run.
+        pending: Messages it has sent, while another process with its nodes is still in the run.
         exchanges: The latest; appended to in any thread.
         drift_ppm: Drift of its clock relative to ours, parts per million, if we follow it.
-        begin: When the first update is, if it has sent that.
+        first_update: When the first update is, if it has sent that.
         returning: Whether it came while the run went on, and is not ready yet.
         outgoing: Memory that was offered to it.
         incoming: Memory of its own that we see.
@@ -96,12 +96,12 @@ class Member:
     lost_at: float = 0.0
     running: bool = False
     unfit: bool = True
-    held: list[tuple[messages.OfTheRun, Event | None]] | None = None
+    pending: list[tuple[messages.OfTheRun, Event | None]] | None = None
     exchanges: deque[Exchange] = field(default_factory=lambda: deque(maxlen=KEPT))
     drift_ppm: float | None = None
     announced: messages.Announcements | None = None
     ready: bool = False
-    begin: messages.FirstUpdate | None = None
+    first_update: messages.FirstUpdate | None = None
     returning: bool = False
     final_summary: Summary | None = None
     has_our_summary: bool = False
@@ -146,12 +146,12 @@ class Member:
 
     def acknowledged(self, ack: messages.Ack) -> None:
         """Handle an acknowledgement: bytes received, and frames read no more."""
-        self.outbox.arrived(ack.arrived)
+        self.outbox.confirm(ack.arrived)
         if self.outgoing is not None:
             self.outgoing.freed.extend(ack.freed)
 
-    def ask_time(self) -> None:
-        """Ask for its time; the answer is an `Exchange`."""
+    def request_time(self) -> None:
+        """Request its time; the answer is an `Exchange`."""
         self.outbox.send(messages.Ping(time.monotonic_ns()))
 
     async def compare_clocks(
@@ -160,7 +160,7 @@ class Member:
         """Measure the offset of its monotonic clock, unless it is lost."""
         self.exchanges.clear()
         for count in range(KEPT):
-            self.ask_time()
+            self.request_time()
             await until(lambda n=count: self.over != "" or len(self.exchanges) > n)  # type: ignore[misc]
 
     def best(self, latest: int = KEPT) -> Exchange | None:
@@ -182,10 +182,10 @@ class Member:
 
 
 class PhaseLockedLoop:
-    """How quickly to run to catch up with a clock: a phase-locked loop of the second order.
+    """Phase-locked loop of the second order: the speed that catches up with another clock.
 
     It is critically damped and settles in half a minute. (As in RFC 5905, section 11.3.) `drift` is
-    how much quicker the other clock is, as far as is known.
+    how much quicker the other clock is, as estimated so far.
     """
 
     PROPORTIONAL = 0.2  # a second
@@ -195,12 +195,12 @@ class PhaseLockedLoop:
         self.drift = 0.0
 
     def factor(self, late: float, seconds: float) -> float:
-        """Return how quickly to run from here on, `late` seconds behind."""
+        """Return the speed from now on, if `late` seconds behind."""
         drift = self.drift + self.INTEGRAL * late * seconds
-        wanted = drift + self.PROPORTIONAL * late
-        if abs(wanted) < MOST_DRIFT:  # else this is more than drift
+        correction = drift + self.PROPORTIONAL * late
+        if abs(correction) < MOST_DRIFT:  # else this is more than drift
             self.drift = drift
-        return 1.0 + min(max(wanted, -MOST_DRIFT), MOST_DRIFT)
+        return 1.0 + min(max(correction, -MOST_DRIFT), MOST_DRIFT)
 
 
 class ClockFollower:
@@ -211,27 +211,27 @@ class ClockFollower:
         self._clock = clock
         self._pursuit = PhaseLockedLoop()
         self._loop = asyncio.get_running_loop()
-        self._asked = 0
-        self._handle = self._loop.call_later(PERIOD, self._ask)
+        self._requests = 0
+        self._handle = self._loop.call_later(PERIOD, self._request_time)
 
     def stop(self) -> None:
-        """Look no more."""
+        """Stop steering the clock."""
         self._handle.cancel()
 
-    def go_on_alone(self) -> None:
-        """Look no more, and run as quickly as the other clock did."""
+    def continue_alone(self) -> None:
+        """Stop comparing, and keep the other clock's speed."""
         self.stop()
         self._clock.steer(1.0 + self._pursuit.drift)
 
-    def _ask(self) -> None:
-        self.member.ask_time()
-        self._asked += 1
-        if self._asked % EXCHANGES == 0:
+    def _request_time(self) -> None:
+        self.member.request_time()
+        self._requests += 1
+        if self._requests % EXCHANGES == 0:
             self._steer()
-        self._handle = self._loop.call_later(PERIOD, self._ask)
+        self._handle = self._loop.call_later(PERIOD, self._request_time)
 
     def _steer(self) -> None:
-        best = self.member.best(EXCHANGES - 1)  # the last was asked for just now
+        best = self.member.best(EXCHANGES - 1)  # the last is still under way
         if best is not None:
             late = best.late / self._clock.speed / SECOND
             self._clock.steer(self._pursuit.factor(late, PERIOD * EXCHANGES))
@@ -240,7 +240,7 @@ class ClockFollower:
 
 log = logging.getLogger("visnav.runtime")
 
-Put = Callable[[bytes, bytes], None]
+Write = Callable[[bytes, bytes], None]
 
 BOUND = 1024  # most events waiting for the network: as many as an input keeps
 SMALL = 8192  # most bytes of a message written by the loop itself: copying takes a microsecond
@@ -258,7 +258,7 @@ class Outbox:
     """Messages on their way to a process, in order.
 
     Args:
-        put: Writes one; may wait.
+        write: Writes one; may wait.
         failed: Called, in the outbox's thread, with the error of a failed write.
 
     Attributes:
@@ -266,12 +266,12 @@ class Outbox:
         memory: Shared with the other process, once confirmed.
     """
 
-    def __init__(self, name: str, put: Put, failed: Callable[[VisnavError], None]) -> None:
+    def __init__(self, name: str, write: Write, failed: Callable[[VisnavError], None]) -> None:
         self.name = name
         self.replaced = 0
         self.peak = 0
         self.memory: Outgoing | None = None
-        self._put = put
+        self._write_to = write
         self._failed = failed
         self._queue: deque[_Waiting] = deque()
         self._skippable: dict[str, _Waiting] = {}
@@ -297,17 +297,17 @@ class Outbox:
             if self._closed:
                 return
             idle = not (self._queue or self._writing) and self._under_way < UNDER_WAY
-            before = self._skippable.get(skip)
-            if before is not None:
-                before.packed = packed
+            earlier = self._skippable.get(skip)
+            if earlier is not None:
+                earlier.packed = packed
                 self.replaced += 1
             elif idle and (parts := self._in_bytes(message, packed, now=True)):
-                self._put_now(*parts)
+                self._write_now(*parts)
             else:
-                self._wait(_Waiting(message, packed, skip))
+                self._enqueue(_Waiting(message, packed, skip))
 
-    def arrived(self, count: int) -> None:
-        """Take in how many bytes have arrived at the other end."""
+    def confirm(self, count: int) -> None:
+        """Confirm the arrival of so many bytes at the other end."""
         with self._changed:
             self._under_way = max(self._under_way - count, 0)
 
@@ -320,7 +320,7 @@ class Outbox:
             self._thread.join(CLOSING)
 
     def abandon(self) -> None:
-        """Write no more: the process has gone."""
+        """Discard the waiting messages, as the process has gone."""
         with self._changed:
             self._queue.clear()
             self._closed = True
@@ -333,22 +333,22 @@ class Outbox:
         if packed is None or packed.size <= SMALL:
             return messages.encode(message), b"" if packed is None else packed.frame()
         if self.memory is not None and not (now and packed.size > AT_ONCE):
-            place = self.memory.put(packed)
+            place = self.memory.store(packed)
             if place is not None:
                 return messages.encode(msgspec.structs.replace(message, place=place)), b""
         return None if now else (messages.encode(message), packed.frame())
 
-    def _put_now(self, head: bytes, frame: bytes) -> None:
+    def _write_now(self, head: bytes, frame: bytes) -> None:
         with self._changed:
             self._under_way += len(head) + len(frame)
         try:
-            self._put(head, frame)
+            self._write_to(head, frame)
         except VisnavError as error:
             self._failed(error)
-        except Exception as error:  # whatever a library does, the outbox goes on
+        except Exception as error:  # any error of a library; the outbox continues
             self._failed(PeerError(f"a message could not be sent: {_describe(error)}"))
 
-    def _wait(self, waiting: _Waiting) -> None:
+    def _enqueue(self, waiting: _Waiting) -> None:
         if waiting.packed is not None:
             if self._events >= BOUND:
                 raise ChannelFullError(
@@ -381,7 +381,7 @@ class Outbox:
             except Exception as error:  # the message goes without its event: others count it
                 parts = messages.encode(waiting.message), b""
                 self._failed(PeerError(f"an event could not be sent: {_describe(error)}"))
-            self._put_now(*parts)
+            self._write_now(*parts)
             self._writing = False
 
 
@@ -399,7 +399,7 @@ def _describe(error: Exception) -> str:
 class Outgoing:
     """Memory written by this process, with large events for another; closed with this object.
 
-    `put` is called by one thread at a time.
+    `store` is called by one thread at a time.
 
     Attributes:
         freed: Places of frames read no more by the other process; appended to from any thread.
@@ -419,8 +419,8 @@ class Outgoing:
             machine=machine(), path=f"/proc/{os.getpid()}/fd/{self._fd}", key=self._key
         )
 
-    def put(self, packed: Packed) -> tuple[int, int] | None:
-        """Put a frame there, and return its place and size; `None` if there is no room."""
+    def store(self, packed: Packed) -> tuple[int, int] | None:
+        """Store a frame there, and return its place and size; `None` if there is no room."""
         while self.freed:
             if offset := self.freed.popleft():  # the key stays at 0
                 self._arena.free(offset)
@@ -442,10 +442,10 @@ class Incoming(MappedFile):
         weakref.finalize(self, os.close, fd)
 
     @classmethod
-    def found(cls, offer: messages.MemoryOffer) -> Incoming | None:
+    def open_offer(cls, offer: messages.MemoryOffer) -> Incoming | None:
         """Return the offered memory; `None` if not accessible from here."""
-        here = offer.machine and offer.machine == machine()
-        if not (here and re.fullmatch(r"/proc/\d+/fd/\d+", offer.path)):
+        same_machine = offer.machine and offer.machine == machine()
+        if not (same_machine and re.fullmatch(r"/proc/\d+/fd/\d+", offer.path)):
             return None
         try:
             fd = os.open(offer.path, os.O_RDWR | os.O_CLOEXEC | os.O_NONBLOCK)

@@ -25,7 +25,7 @@ from runtime.errors import PeerError, VisnavError, WireError
 from runtime.time.lockstep import LockstepLoop
 from runtime.time.real_time import real_time_limit
 from visnav_machines import messages
-from visnav_machines.handshake import Handshakes, check_fits, what_all_share
+from visnav_machines.handshake import Handshakes, check_fits, shared_settings
 from visnav_machines.member import Exchange, Incoming, Member, Outgoing
 from visnav_machines.session import ForgedError, Session, certified, derive, is_hello, secret_of
 
@@ -62,7 +62,7 @@ class Seat:
 
 
 class Run(Protocol):
-    """What a membership tells of the other processes; called on the run's loop."""
+    """Receiver of a membership's notifications; called on the run's loop."""
 
     def receive(self, member: Member, message: messages.OfTheRun, event: Event | None) -> None:
         """Handle a message of another process, or raise `WireError`."""
@@ -104,7 +104,7 @@ class Membership:
         self._before = 0
         self.hello = messages.Hello(
             nodes=self.here,
-            config=what_all_share(config),
+            config=shared_settings(config),
             place=f"{socket.gethostname()}, process {os.getpid()}",
             began=time.time(),
         )
@@ -198,7 +198,7 @@ class Membership:
             member.outbox.send(message)
 
     def settle(self, *, lost: Iterable[str] = (), left_out: Iterable[str] = ()) -> None:
-        """State in hellos from now on: the run goes on, with these nodes lost or left out."""
+        """State in hellos from now on that the run continues, with these nodes lost or left out."""
         lost, left_out = (*self.hello.lost, *lost), (*self.hello.left_out, *left_out)
         self.hello = msgspec.structs.replace(self.hello, running=True, lost=lost, left_out=left_out)
 
@@ -233,7 +233,7 @@ class Membership:
         if isinstance(message, messages.EventMessage):
             try:
                 event = member.event(message, payload)
-            except Exception as error:  # it is counted all the same: in lockstep, all are awaited
+            except Exception as error:  # counted all the same: in lockstep, all are awaited
                 log.warning("from %s: %s", member.place, error)
         if isinstance(message, messages.Ack):
             member.acknowledged(message)
@@ -250,13 +250,13 @@ class Membership:
             case messages.Hello():
                 pass
             case messages.MemoryOffer():
-                member.incoming = Incoming.found(message) if self._network.shared else None
+                member.incoming = Incoming.open_offer(message) if self._network.shared else None
                 if member.incoming is not None:
                     member.outbox.send(messages.MemoryMapped())
             case messages.MemoryMapped():
                 member.outbox.memory = member.outgoing
             case _:
-                self.soon(self.take, member, message, event)
+                self.soon(self.deliver, member, message, event)
         member.acknowledge(len(data) + len(payload))
 
     def soon(self, call: Callable[..., Any], *args: Any) -> None:
@@ -271,11 +271,11 @@ class Membership:
         if self.ended is None:
             log.warning("to %s: %s", name, error)
 
-    def take(self, member: Member, message: messages.OfTheRun, event: Event | None) -> None:
+    def deliver(self, member: Member, message: messages.OfTheRun, event: Event | None) -> None:
         """Pass on a message, unless its session has ended; invalid messages are logged."""
         try:
-            if member.held is not None:
-                member.held.append((message, event))
+            if member.pending is not None:
+                member.pending.append((message, event))
             elif member.unfit or member.over:
                 log.debug("from %s, who is no part of this run: %s", member.place, message)
             else:
@@ -316,7 +316,7 @@ class Membership:
                 return
             seat = self.seats[number]
             if seat.member is not None:  # the one before has gone, but we do not know yet
-                member.held = member.held or []
+                member.pending = member.pending or []
                 return
             member.number, seat.member = number, member
             if seat.absent is not None:
@@ -326,16 +326,16 @@ class Membership:
         if self.count:
             self._peers.joined(member)
         self._number_all()
-        held, member.held = member.held, None
-        for message, event in held or ():
-            self.take(member, message, event)
+        pending, member.pending = member.pending, None
+        for message, event in pending or ():
+            self.deliver(member, message, event)
         self.waiting.notify()
 
-    def left(self, member: Member, why: str = "their process is gone") -> None:
-        """Go on without a process whose session has ended."""
+    def left(self, member: Member, reason: str = "their process is gone") -> None:
+        """Handle the end of a process's session."""
         if member.over:
             return
-        member.over = why
+        member.over = reason
         member.lost_at = time.monotonic()
         member.outbox.abandon()
         early = not self.hello.running and self.ended is None
@@ -350,7 +350,7 @@ class Membership:
             else:
                 self._peers.lost(member)
             for other in self._handshakes.members() if self._handshakes else ():
-                if other.held is not None and other.nodes == member.nodes:
+                if other.pending is not None and other.nodes == member.nodes:
                     self.joined(other)
         self.waiting.notify()
 
@@ -381,68 +381,72 @@ class Waiting:
         condition: Callable[[], bool],
         *,
         despite: bool = False,
-        whom: Callable[[Member], bool] | None = None,
+        is_awaited: Callable[[Member], bool] | None = None,
         limit: float = math.inf,
     ) -> None:
         """Wait until others meet a condition; holds simulated time unless `despite`.
 
         Args:
-            condition: Checked whenever something has come.
-            despite: Go on waiting though something has failed: the run ends anyway.
-            whom: Tells who is waited for; they are named when it takes long.
-            limit: Real seconds after which it takes too long, if `whom` is given. They count from
+            condition: Checked after each message.
+            despite: Continue waiting after a failure, as the run ends anyway.
+            is_awaited: Returns whether a process is waited for; those are named in messages.
+            limit: Real seconds after which it takes too long, with `is_awaited`. They count from
                 the first loss of a process, if that is later: it has to start again.
 
         Raises:
             PeerError: It takes too long, or a process that was lost has not returned in time.
-            VisnavError: It will not come; see `fail`.
+            VisnavError: The condition cannot be met any more; see `fail`.
         """
-        begin = time.monotonic()
+        start = time.monotonic()
         while True:
             if self._broken is not None and not despite:
                 raise self._broken
             if condition():
                 return
-            hold = contextlib.nullcontext() if despite else _time_stands()
-            left = min(NAMED_EVERY, max(self._time_left(begin, limit), 0.0))
-            patience = contextlib.nullcontext() if whom is None else real_time_limit(left)
+            gate = contextlib.nullcontext() if despite else _time_stands()
+            remaining = min(NAMED_EVERY, max(self._time_left(start, limit), 0.0))
+            patience = (
+                contextlib.nullcontext() if is_awaited is None else real_time_limit(remaining)
+            )
             try:
-                with hold:
+                with gate:
                     async with patience:
                         await self._changed.wait()
             except TimeoutError:
-                assert whom is not None
-                self._name(whom, limit, late=self._time_left(begin, limit) <= 0)
+                assert is_awaited is not None
+                self._report_slow(is_awaited, limit, late=self._time_left(start, limit) <= 0)
 
     def notify(self) -> None:
-        """Have all waits check their conditions again."""
+        """Make all waits check their conditions again."""
         self._changed.set()  # which wakes those that wait now
         self._changed.clear()
 
     def fail(self, error: VisnavError) -> None:
-        """Let all waits fail."""
+        """Make all waits fail."""
         self._broken = self._broken or error
         self.notify()
 
-    def _time_left(self, begin: float, limit: float) -> float:
+    def _time_left(self, start: float, limit: float) -> float:
         if limit == math.inf:
             return limit
-        ends = [max([begin, *(seat.first_loss for seat in self._seats)]) + limit]
+        ends = [max([start, *(seat.first_loss for seat in self._seats)]) + limit]
         if not any(s.member and s.member.running for s in self._seats):  # else it goes on without
             ends += [s.absent.lost_at + self._startup_limit for s in self._seats if s.absent]
         return min(ends) - time.monotonic()
 
-    def _name(self, whom: Callable[[Member], bool], limit: float, *, late: bool) -> None:
+    def _report_slow(
+        self, is_awaited: Callable[[Member], bool], limit: float, *, late: bool
+    ) -> None:
         members = [seat.member for seat in self._seats if seat.member]
-        slow = "; ".join(f"{m.name} ({m.place})" for m in members if whom(m))
-        gone = "; ".join(_loss(seat.absent) for seat in self._seats if seat.absent)
-        if late and gone:
+        slow = "; ".join(f"{m.name} ({m.place})" for m in members if is_awaited(m))
+        losses = "; ".join(_loss(seat.absent) for seat in self._seats if seat.absent)
+        if late and losses:
             within = f"{self._startup_limit:g} s (run.startup_limit)"
-            raise PeerError(f"{gone}: expected its return within {within}, found none") from None
+            raise PeerError(f"{losses}: expected its return within {within}, found none") from None
         if late:
             within = f"{limit:g} s (of run.startup_limit for each node)"
             raise PeerError(f"expected a word within {within} of {slow}, found none") from None
-        log.info("still waiting for %s", "; ".join(filter(None, [gone, slow])))
+        log.info("still waiting for %s", "; ".join(filter(None, [losses, slow])))
 
 
 def _loss(member: Member) -> str:

@@ -150,7 +150,7 @@ class Stop(Message, frozen=True):
 
 
 class NodeEnded(Message, frozen=True):
-    """A node of mine has ended, and hears nothing any more."""
+    """A node of the sender has ended, and receives nothing any more."""
 
     node: str
     serial: int = AT_ONCE
@@ -200,7 +200,7 @@ class Ack(Message, frozen=True):
 
 
 class TokenRequest(Message, frozen=True):
-    """Give me a turn: something came from outside."""
+    """Request of a turn, as something came from outside."""
 
 
 class StateReport(Message, frozen=True):

@@ -52,27 +52,27 @@ class Peers(Others):
         self._membership = Membership(config, only, self)
         self._start = JointStart(self._membership, clock, float(config.run.startup_limit))
         self.shutdown = JointShutdown(self._membership, self._gather)
-        self._remote = RemoteEvents(config.nodes, self._membership, self._leave)
+        self._remote = RemoteEvents(config.nodes, self._membership, self._send_event)
         self._loop: LockstepLoop | None = None
         self._token: TimeTokenHolder | None = None
         self._early: list[tuple[Member, messages.OfTheRun, Event | None]] = []
-        self._met = self._begun = False
+        self._has_met = self._has_begun = False
         self._ended_here: list[str] = []
         self._follower: ClockFollower | None = None
 
     # Before the run.
 
     async def meet(self) -> int:
-        """Wait until all nodes of the file are there."""
+        """Wait until all nodes of the file are connected."""
         membership = self._membership
         before = await membership.meet()
-        self._met = True
+        self._has_met = True
         if isinstance(self._clock, LockstepClock):
             loop = asyncio.get_running_loop()
             assert isinstance(loop, LockstepLoop)
             self._loop = loop
             self._token = TimeTokenHolder(
-                membership.me, membership.count, loop, self._send_to, self._do
+                membership.me, membership.count, loop, self._send_to, self._handle
             )
         self._receive_early()
         return before
@@ -84,7 +84,7 @@ class Peers(Others):
     async def begin(self) -> None:
         """Agree with the others on the first update, and wait until then."""
         self._reconnect()
-        self._follow(await self._start.begin())
+        self._follow(await self._start.wait_for_first_update())
 
     def _follow(self, member: Member | None) -> None:
         if member is not None and isinstance(self._clock, RealClock):
@@ -94,9 +94,9 @@ class Peers(Others):
         """Do nothing: `begin` has started the clock."""
 
     def nodes_run(self) -> None:
-        """Deliver messages from now on: the nodes here have begun."""
-        self._begun = True
-        self._start.over()
+        """Deliver messages from now on, as the nodes here run."""
+        self._has_begun = True
+        self._start.mark_over()
         self._membership.settle()
         if self._loop is not None:
             self._loop.move(0, (len(self._membership.nodes) << 33, self._membership.me << 32))
@@ -110,7 +110,7 @@ class Peers(Others):
     def _receive_early(self) -> None:
         early, self._early = self._early, []
         for item in early:
-            self._membership.take(*item)
+            self._membership.deliver(*item)
 
     # During the run.
 
@@ -121,7 +121,7 @@ class Peers(Others):
     def connect(self, listeners: list[Listener], fault: Fault) -> None:
         """Connect the listeners here to outputs elsewhere, and notify the others."""
         self._remote.connect(listeners, fault)
-        self._start.say(
+        self._start.send(
             messages.Subscriptions(
                 subscriptions(listener for listener in listeners if listener.node != "run")
             )
@@ -133,11 +133,11 @@ class Peers(Others):
         They may receive it from us first.
         """
         text = None if error is None else str(error)
-        stop = messages.Stop(reason, text, apart=not self._begun, by=by)
+        stop = messages.Stop(reason, text, apart=not self._has_begun, by=by)
         self._membership.ended = msgspec.structs.replace(stop, apart=True)
         for seat in self._membership.seats.values():
             seat.absent = None
-        if not self._begun:  # also its senders: they need not wait for our turn
+        if not self._has_begun:  # also its senders: they need not wait for our turn
             self._membership.broadcast(stop)
             self._receive_early()
         elif self._time_stands():
@@ -145,7 +145,7 @@ class Peers(Others):
             self._gather(at_once=True)
         elif not from_peer:
             self._broadcast_in_order(stop)
-        self.shutdown.begin()
+        self.shutdown.start_watching()
 
     def node_ended(self, node: str) -> None:
         """Notify the others of the end of a node here."""
@@ -161,7 +161,7 @@ class Peers(Others):
 
     async def leave(self, summary: Summary) -> Summary:
         """Exchange summaries and leave; return the summary of all processes."""
-        whole = await self.shutdown.exchange_summaries(summary)
+        merged = await self.shutdown.exchange_summaries(summary)
         self.shutdown.close()
         if self._follower is not None:
             self._follower.stop()
@@ -169,58 +169,58 @@ class Peers(Others):
         if self._loop is not None:
             self._loop.gate = None
         await self._membership.close()
-        return whole
+        return merged
 
-    # What the membership notifies of.
+    # Notifications of the membership.
 
     def receive(self, member: Member, message: messages.OfTheRun, event: Event | None) -> None:
-        """Take in a message of another process, or raise `WireError`."""
+        """Handle a message of another process, or raise `WireError`."""
         self.shutdown.received_at = time.monotonic()
         ends = self._membership.ended is not None
         match message:
-            case messages.EventMessage() if self._begun and self._token is None:  # most of all
-                self._do(member.number, message, event)
+            case messages.EventMessage() if self._has_begun and self._token is None:  # most of all
+                self._handle(member.number, message, event)
             case messages.Announcements():
-                self._start.hear(member, message)
+                self._start.record_announcements(member, message)
             case messages.FinalSummary():
-                self.shutdown.hear(member, message)
+                self.shutdown.record_summary(member, message)
             case messages.SummaryReceived():
                 member.has_our_summary = True
             case messages.FirstUpdate():
-                member.begin = message
+                member.first_update = message
                 member.running = True
             case messages.Ready():
                 member.ready = True
                 member.running = member.running or message.begun
                 if member.returning:
                     member.returning = False
-                    self._take_back(member, begun=message.begun)
+                    self._readmit(member, begun=message.begun)
             case messages.Subscriptions():
-                if not self._met:  # the processes have no numbers yet
+                if not self._has_met:  # the processes have no numbers yet
                     self._early.append((member, message, event))
                     return
-                self._remote.wants(member.number, message.wanted)
-                if self._begun:
+                self._remote.subscribe(member.number, message.wanted)
+                if self._has_begun:
                     self._reconnect()
-            case messages.Stop() if not self._begun or message.serial < 0:
+            case messages.Stop() if not self._has_begun or message.serial < 0:
                 if message.apart:
-                    self._go_on_without(member)
-                elif self._time_stands():  # it is no use to wait for a return
+                    self._exclude(member)
+                elif self._time_stands():  # a return is not awaited any more
                     self._gather(at_once=True)
-                self._do(member.number, message, None)
+                self._handle(member.number, message, None)
             case messages.NodeEnded() if message.node not in member.nodes:
                 raise WireError(f"expected one of its nodes, found {message.node!r}")
-            case messages.NodeEnded() if message.serial < 0 or (ends and not self._begun):
-                self._do(member.number, message, None)
+            case messages.NodeEnded() if message.serial < 0 or (ends and not self._has_begun):
+                self._handle(member.number, message, None)
             case messages.StillWorking():
                 pass
-            case _ if not self._begun:
+            case _ if not self._has_begun:
                 if not ends:
                     self._early.append((member, message, event))
             case _ if self._token is not None:
-                self._token.take(member.number, message, event)
+                self._token.receive(member.number, message, event)
             case messages.EventMessage() | messages.Stop() | messages.NodeEnded():
-                self._do(member.number, message, event)
+                self._handle(member.number, message, event)
             case _ if not ends:
                 raise WireError("expected the run to be in lockstep there, too")
 
@@ -228,51 +228,51 @@ class Peers(Others):
         """Deal with the loss of a process as its nodes' `on_error` says."""
         lost = set(member.nodes) - self.shutdown.ended_nodes
         self.shutdown.ended_nodes |= lost
-        gone = PeerError(f"{member.name}: {member.over} ({member.place})")
+        loss = PeerError(f"{member.name}: {member.over} ({member.place})")
         ended = self._membership.ended
         if member.returning and ended is None:
-            log.error("%s: waiting for its return again", gone)
+            log.error("%s: waiting for its return again", loss)
             self._membership.settle(lost=member.nodes)
             return
         if ended is not None or not lost:
             if lost:
-                log.warning("%s: the run ends without it", gone)
-            if lost and ended is not None and self._begun and self._token is not None:
+                log.warning("%s: the run ends without it", loss)
+            if lost and ended is not None and self._has_begun and self._token is not None:
                 # Others may wait for its return, and not for their turn.
                 self._membership.broadcast(msgspec.structs.replace(ended, apart=False))
             self._gather(at_once=ended is not None)
             return
         if self._follower is not None and self._follower.member is member:
-            self._follower.go_on_alone()
-        self._remote.wants(member.number, ())
+            self._follower.continue_alone()
+        self._remote.subscribe(member.number, ())
         rules = {spec.on_error for spec in self._config.nodes if spec.name in lost}
         if "stop" in rules:
-            log.error("%s", gone, extra={"reported": True})
+            log.error("%s", loss, extra={"reported": True})
             self._gather()
-            self._stop(f"{member.name} lost", gone, by=min(lost))
+            self._stop(f"{member.name} lost", loss, by=min(lost))
         elif "restart" in rules:
-            log.error("%s: waiting for its return", gone)
+            log.error("%s: waiting for its return", loss)
             self._membership.settle(lost=member.nodes)
             if self._token is not None:
                 self._membership.seats[member.number].awaited = True
                 self._token.suspend()
         else:
-            log.error("%s: left out from here on", gone)
+            log.error("%s: left out from here on", loss)
             self._membership.settle(left_out=lost)
             self._gather()
         self._reconnect()
 
     def joined(self, member: Member) -> None:
         """Handle a process joining or returning after the numbering of processes."""
-        self._start.say_again(member)
-        member.returning = self._begun  # until it is ready, the run goes on without it
+        self._start.resend(member)
+        member.returning = self._has_begun  # until it is ready, the run goes on without it
 
     def now(self, ago: int = 0) -> int:
         """Return the time of the run's clock, so many real nanoseconds ago; in any thread."""
         speed = self._clock.speed if isinstance(self._clock, RealClock) else 0
         return self._clock.now() - round(ago * speed)
 
-    def _do(self, number: int, message: messages.Ordered, event: Event | None) -> None:
+    def _handle(self, number: int, message: messages.Ordered, event: Event | None) -> None:
         try:
             match message:
                 case messages.EventMessage():
@@ -280,8 +280,8 @@ class Peers(Others):
                         self._remote.arrive(number, message.output, event)
                 case messages.Stop():
                     member = self._membership.numbered(number)
-                    where = member.name if member else "?"
-                    failed = PeerError(f"at {where}: {message.error}") if message.error else None
+                    name = member.name if member else "?"
+                    failed = PeerError(f"at {name}: {message.error}") if message.error else None
                     self._stop(message.reason, failed, by=message.by, from_peer=True)
                 case messages.NodeEnded():
                     self.shutdown.ended_nodes.add(message.node)
@@ -289,10 +289,10 @@ class Peers(Others):
             log.warning("from process %d: %s", number, error)
         self._membership.waiting.notify()
 
-    def _take_back(self, member: Member, *, begun: bool) -> None:
+    def _readmit(self, member: Member, *, begun: bool) -> None:
         """Readmit a process: a new instance, or (if `begun`) the same, reconnected."""
-        what = "found again" if begun else "back"
-        log.warning("%s: %s, at %s", member.name, what, member.place)
+        state = "found again" if begun else "back"
+        log.warning("%s: %s, at %s", member.name, state, member.place)
         if not begun:
             now = self._clock.now()
             real = now / self._clock.speed if isinstance(self._clock, RealClock) else 0
@@ -311,7 +311,7 @@ class Peers(Others):
 
     def _gather(self, *, at_once: bool = False) -> None:
         """In lockstep, share turns among the processes present, unless one is awaited."""
-        if self._token is None or self._loop is None or not self._begun:
+        if self._token is None or self._loop is None or not self._has_begun:
             return
         membership, seats = self._membership, self._membership.seats.values()
         if at_once:
@@ -330,7 +330,7 @@ class Peers(Others):
         for seat in seats:
             seat.new = False
 
-    def _go_on_without(self, member: Member) -> None:
+    def _exclude(self, member: Member) -> None:
         """Exclude a process from the turns: not begun yet, or given up."""
         if seat := self._membership.seats.get(member.number):
             seat.apart = True
@@ -342,12 +342,12 @@ class Peers(Others):
 
     def _broadcast_in_order(self, message: messages.Ordered) -> None:
         for number, seat in self._membership.seats.items():
-            if self._token is not None and self._begun and seat.member and not seat.apart:
+            if self._token is not None and self._has_begun and seat.member and not seat.apart:
                 self._token.post(number, message)
             elif seat.member:
                 seat.member.outbox.send(message)
 
-    def _leave(self, process: int, output: str, event: Event, skip: bool) -> None:
+    def _send_event(self, process: int, output: str, event: Event, skip: bool) -> None:
         if self._token is not None:
             self._token.post(process, messages.EventMessage(output), event)
         elif member := self._membership.numbered(process):
@@ -361,17 +361,19 @@ class Peers(Others):
             member.outbox.send(message, event)
 
 
-Leave = Callable[[int, str, Event, bool], None]
+SendEvent = Callable[[int, str, Event, bool], None]
 """Sends an event: process number, output, event, and whether a newer event may replace this."""
 
 
 class RemoteEvents:
     """Outputs here with listeners in other processes, and outputs there with listeners here."""
 
-    def __init__(self, specs: Iterable[NodeSpec], membership: Membership, leave: Leave) -> None:
+    def __init__(
+        self, specs: Iterable[NodeSpec], membership: Membership, send_event: SendEvent
+    ) -> None:
         self._membership = membership
-        self._leave = leave
-        self._wanted: dict[int, list[_Wanted]] = {}
+        self._send_event = send_event
+        self._inputs: dict[int, list[_RemoteInput]] = {}
         self._arrivals: dict[str, Sender[Any]] = {
             (name := f"{spec.name}.{port}"): Sender(name, output.event)
             for spec in specs
@@ -379,17 +381,20 @@ class RemoteEvents:
             for port, output in spec.node.declared.outputs.items()
         }
 
-    def wants(self, process: int, wanted: tuple[messages.Subscription, ...]) -> None:
+    def subscribe(self, process: int, subscriptions: tuple[messages.Subscription, ...]) -> None:
         """Record the subscriptions of a process, empty if gone; `WireError` for unknown events."""
-        self._wanted[process] = [
-            _Wanted(tuple(map(event_type, want.kinds)), want.source, want.latest) for want in wanted
+        self._inputs[process] = [
+            _RemoteInput(
+                tuple(map(event_type, subscription.kinds)), subscription.source, subscription.latest
+            )
+            for subscription in subscriptions
         ]
 
     def listeners(self, output: str) -> list[Listener]:
         """Return the listeners in other processes; before those here, to reach them in any case."""
         return [
-            RemoteListener(process, output, wanted, self._leave)
-            for process, wanted in sorted(self._wanted.items())
+            RemoteListener(process, output, inputs, self._send_event)
+            for process, inputs in sorted(self._inputs.items())
         ]
 
     def connect(self, listeners: Iterable[Listener], fault: Fault) -> None:
@@ -410,7 +415,7 @@ class RemoteEvents:
         sender.send(event)
 
 
-class _Wanted(Listener):
+class _RemoteInput(Listener):
     """In the place of an input or handler there."""
 
     __slots__ = ("latest",)
@@ -423,37 +428,39 @@ class _Wanted(Listener):
 class RemoteListener(Listener):
     """All inputs and handlers of another process, as a single listener of an output."""
 
-    __slots__ = ("_leave", "_may_skip", "_output", "_process", "_wanted", "name")
+    __slots__ = ("_inputs", "_may_skip", "_output", "_process", "_send_event", "name")
 
-    def __init__(self, process: int, output: str, wanted: Iterable[_Wanted], leave: Leave) -> None:
+    def __init__(
+        self, process: int, output: str, inputs: Iterable[_RemoteInput], send_event: SendEvent
+    ) -> None:
         super().__init__("", self.offer, ())
-        self.name = output  # whose fault it is if it cannot leave
+        self.name = output  # named in errors of sending
         self._process = process
         self._output = output
-        self._leave = leave
-        self._wanted = wanted
+        self._send_event = send_event
+        self._inputs = inputs
         self._may_skip: dict[tuple[type[Event], str], bool] = {}
 
     def may_receive(self, event: type[Event]) -> bool:
         """Return whether anything there can receive from an output of this type."""
-        return any(wanted.may_receive(event) for wanted in self._wanted)
+        return any(port.may_receive(event) for port in self._inputs)
 
     def receives_all(self, event: type[Event]) -> bool:
         """Return whether any listener there receives all events of an output of this type."""
-        return any(wanted.receives_all(event) for wanted in self._wanted)
+        return any(port.receives_all(event) for port in self._inputs)
 
     def receives(self, event: type[Event], source: str) -> bool:
         """Return whether anything there receives events of this very type from this source."""
-        return any(wanted.receives(event, source) for wanted in self._wanted)
+        return any(port.receives(event, source) for port in self._inputs)
 
     def offer(self, event: Event) -> None:
         """Send an event there."""
         key = (type(event), event.source)
         skip = self._may_skip.get(key)
         if skip is None:
-            skip = all(wanted.latest for wanted in self._wanted if wanted.receives(*key))
+            skip = all(port.latest for port in self._inputs if port.receives(*key))
             self._may_skip[key] = skip
-        self._leave(self._process, self._output, event, skip)
+        self._send_event(self._process, self._output, event, skip)
 
 
 def subscriptions(listeners: Iterable[Listener]) -> tuple[messages.Subscription, ...]:

@@ -71,13 +71,17 @@ class Session:
         configuration = _configuration(network)
         _warn_if_open(configuration)
         try:
-            with tempfile.NamedTemporaryFile("w", suffix=".door") as door:  # its user's alone
+            with tempfile.NamedTemporaryFile("w", suffix=".door") as file:  # its user's alone
                 if not network.zenoh:
-                    word = derive(secret, "door").hex()
-                    door.write(f"visnav:{word}\n")
-                    door.flush()
-                    known = {"user": "visnav", "password": word, "dictionary_file": door.name}
-                    configuration.insert_json5("transport/auth/usrpwd", json.dumps(known))
+                    password = derive(secret, "door").hex()
+                    file.write(f"visnav:{password}\n")
+                    file.flush()
+                    credentials = {
+                        "user": "visnav",
+                        "password": password,
+                        "dictionary_file": file.name,
+                    }
+                    configuration.insert_json5("transport/auth/usrpwd", json.dumps(credentials))
                 self._session = zenoh.open(configuration)
         except (zenoh.ZError, OSError) as error:
             raise PeerError(f"expected to meet at {network.meet}, found: {error}") from error
@@ -85,39 +89,39 @@ class Session:
         self._meet = network.meet if network.meet in _endpoints(configuration, "listen") else ""
         self._prefix = f"visnav/{re.sub(r'[^A-Za-z0-9_.-]', '_', run)}"
         self._publishers: dict[str, Any] = {}
-        self._kept: list[Any] = []
+        self._declarations: list[Any] = []
 
     def appear(self, on_message: OnMessage, on_presence: OnPresence) -> None:
-        """Be seen by the others, and see them.
+        """Become visible to the others, and watch them.
 
         Args:
             on_presence: Called for processes that come and go, this one not included.
         """
 
-        def take(sample: zenoh.Sample) -> None:
+        def receive(sample: zenoh.Sample) -> None:
             head = sample.attachment
             if head is not None:
                 sender = str(sample.key_expr).rpartition("/")[2]
                 on_message(sender, head.to_bytes(), sample.payload.to_bytes())
 
-        def notice(sample: zenoh.Sample) -> None:
+        def report(sample: zenoh.Sample) -> None:
             other = str(sample.key_expr).rpartition("/")[2]
             if other != self.id:
                 on_presence(other, sample.kind == zenoh.SampleKind.PUT)
 
-        self._kept = [
+        self._declarations = [
             self._session.declare_subscriber(
-                f"{self._prefix}/to/{self.id}/*", zenoh.handlers.Callback(take, indirect=False)
+                f"{self._prefix}/to/{self.id}/*", zenoh.handlers.Callback(receive, indirect=False)
             ),
             self._session.liveliness().declare_token(f"{self._prefix}/here/{self.id}"),
             self._session.liveliness().declare_subscriber(
                 f"{self._prefix}/here/*",
-                zenoh.handlers.Callback(notice, indirect=False),
+                zenoh.handlers.Callback(report, indirect=False),
                 history=True,
             ),
         ]
 
-    def put(self, other: str, message: bytes, payload: bytes) -> None:
+    def send(self, other: str, message: bytes, payload: bytes) -> None:
         """Send a message to a process; waits if the network does."""
         if other not in self._publishers:
             self._publishers[other] = self._session.declare_publisher(
@@ -132,9 +136,9 @@ class Session:
             raise PeerError(f"a message could not be sent: {error}") from error
 
     def deserted(self) -> bool:
-        """Return whether nobody listens where processes meet, so far as can be told.
+        """Return whether no process listens at the meeting point, as far as is known.
 
-        Zenoh tries to do so only as it opens: later, its tries would keep it from closing
+        Zenoh tries to listen only as it opens: later, its tries would keep it from closing
         (github.com/eclipse-zenoh/zenoh/pull/2754).
         """
         parts = _ENDPOINT.fullmatch(self._meet)
@@ -149,7 +153,7 @@ class Session:
         return False
 
     def close(self) -> None:
-        """Leave; after `CLOSING` seconds, closing goes on in a thread."""
+        """Close the session; after `CLOSING` seconds, closing continues in a thread."""
         thread = threading.Thread(target=self._session.close, name="zenoh close")
         thread.start()
         thread.join(CLOSING)
@@ -200,8 +204,8 @@ def certified(network: NetworkConfig) -> bool:
     return bool(network.zenoh and mutual and all(e.startswith(("tls/", "quic/")) for e in ends))
 
 
-def _endpoints(configuration: zenoh.Config, way: str) -> list[str]:
-    ends = json.loads(configuration.get_json(f"{way}/endpoints"))
+def _endpoints(configuration: zenoh.Config, key: str) -> list[str]:
+    ends = json.loads(configuration.get_json(f"{key}/endpoints"))
     return ends if isinstance(ends, list) else [e for group in ends.values() for e in group]
 
 
@@ -229,10 +233,12 @@ def _beside(meet: str) -> list[str]:
         family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         with socket.socket(family, kind) as probe:
             probe.connect(address)  # of datagrams: nothing is sent
-            mine = probe.getsockname()[0]
+            own_address = probe.getsockname()[0]
     except OSError:  # no way there yet: Zenoh tries on
         return []
-    return [f"{protocol}/[{mine}]:0" if ":" in mine else f"{protocol}/{mine}:0"]
+    return [
+        f"{protocol}/[{own_address}]:0" if ":" in own_address else f"{protocol}/{own_address}:0"
+    ]
 
 
 def _is_here(endpoint: str) -> bool:
@@ -267,17 +273,17 @@ def derive(secret: bytes, *about: str | bytes) -> bytes:
 
 
 class Seal:
-    """Puts seals on messages, and opens messages sealed with the same key."""
+    """Seals messages, and opens messages sealed with the same key."""
 
     def __init__(self, key: bytes) -> None:
         self._keyed = hashlib.blake2b(key=key, digest_size=_TAG)
 
-    def put_on(self, number: int, message: bytes, payload: bytes = b"") -> bytes:
+    def seal_message(self, number: int, message: bytes, payload: bytes = b"") -> bytes:
         """Return the message with its seal."""
         head = _HEAD.pack(VERSION, number, len(message))
         return head + self._tag(head, message, payload) + message
 
-    def take_off(self, number: int, sealed: bytes, payload: bytes = b"") -> bytes:
+    def unseal(self, number: int, sealed: bytes, payload: bytes = b"") -> bytes:
         """Return the message without its seal.
 
         Raises:
@@ -315,23 +321,25 @@ class Sealing:
         tag: Names the session.
     """
 
-    def __init__(self, key: bytes, mine: tuple[str, bytes], other: tuple[str, bytes]) -> None:
-        self.nonce, self.seen = mine[1], other[1]
-        both = [part for pair in sorted((mine, other)) for part in pair]
+    def __init__(
+        self, key: bytes, own_end: tuple[str, bytes], other_end: tuple[str, bytes]
+    ) -> None:
+        self.nonce, self.seen = own_end[1], other_end[1]
+        both = [part for pair in sorted((own_end, other_end)) for part in pair]
         self.tag = derive(key, "tag", *both)[:NONCE]
-        self._out = Seal(derive(key, "session", mine[0], *both))
-        self._in = Seal(derive(key, "session", other[0], *both))
-        self._sent = self._taken = 0
+        self._out = Seal(derive(key, "session", own_end[0], *both))
+        self._in = Seal(derive(key, "session", other_end[0], *both))
+        self._sent = self._opened = 0
 
     def seal(self, message: bytes, payload: bytes) -> bytes:
         """Seal the next message to the other process; for a single thread at a time."""
         self._sent += 1
-        return self._out.put_on(self._sent, message, payload)
+        return self._out.seal_message(self._sent, message, payload)
 
     def open(self, sealed: bytes, payload: bytes) -> bytes:
-        """Open the next message of the other process; raises like `Seal.take_off`."""
-        message = self._in.take_off(self._taken + 1, sealed, payload)
-        self._taken += 1
+        """Open the next message of the other process; raises like `Seal.unseal`."""
+        message = self._in.unseal(self._opened + 1, sealed, payload)
+        self._opened += 1
         return message
 
 
@@ -356,17 +364,17 @@ def secret_of(setting: str) -> bytes:
     elif kind == "file":
         secret = _read(Path(name).expanduser())
     else:
-        secret = setting or _of_this_user()
+        secret = setting or _user_secret()
     if len(secret) < SHORTEST:
-        where = setting if kind in {"env", "file"} else "the file"
+        place = setting if kind in {"env", "file"} else "the file"
         raise PeerError(
-            f"network.secret: expected at least {SHORTEST} characters in {where}, found "
+            f"network.secret: expected at least {SHORTEST} characters in {place}, found "
             f"{len(secret)}"
         )
     return secret.encode()
 
 
-def _of_this_user() -> str:
+def _user_secret() -> str:
     try:
         path = user_folder() / "network.key"
         if not path.exists():

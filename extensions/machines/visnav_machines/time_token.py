@@ -6,7 +6,7 @@ first; then it passes the turn on, with the time, and with the counters that ord
 one time. So everything happens in the order in which one process would have done it, and workers
 and threads go on beside in all processes at once.
 
-Here are no sockets: messages go out through `send`, and come in by `take`.
+Here are no sockets: messages are sent by `send`, and passed to `receive`.
 """
 
 from __future__ import annotations
@@ -60,18 +60,18 @@ class TimeTokenHolder:
         self._received = [0] * count
         self._reported_key: Key = NEVER
         self._called = False
-        self._others: Key = NEVER
+        self._next_elsewhere: Key = NEVER
         self._alive: frozenset[int] = frozenset()
         self._ids: tuple[str, ...] = ()
         self._reports: dict[int, StateReport] = {}
         self._report_due = False
 
-    # Who is there.
+    # Processes of the turn.
 
     def gather(self, alive: Sequence[int], ids: Sequence[str], new: Sequence[int] = ()) -> None:
-        """Begin anew with these processes, by number and id: the turn may be lost.
+        """Start again with these processes, by number and id, as the turn may be lost.
 
-        There is a turn again once all report the same ids; `new` were not there before, or have
+        There is a turn again once all report the same ids; `new` were absent before, or have
         changed.
         """
         self._alive = frozenset(alive)
@@ -88,13 +88,13 @@ class TimeTokenHolder:
         self._outbox = [item for item in self._outbox if item[0] in self._alive]
 
     def suspend(self) -> None:
-        """Let time stand until processes are gathered again."""
+        """Stop time until processes are gathered again."""
         self.holding = False
         self._next = None
         self._report_due = False
         self._oldest = self._epoch + 1
 
-    # What the loop asks, whenever nothing is ready.
+    # Called by the loop, whenever nothing is ready.
 
     def may_go(self, key: Key) -> bool:
         """Return whether time may advance to the next thing due here."""
@@ -107,9 +107,9 @@ class TimeTokenHolder:
                     self._send(other, TokenRequest(), None)
             return False
         if not (self._outbox or self._unread or self._calls):
-            if key == NEVER == self._others:  # what comes now comes from outside
+            if key == NEVER == self._next_elsewhere:  # what comes now comes from outside
                 return False
-            if key <= self._others:
+            if key <= self._next_elsewhere:
                 return True
         self._flush()
         self._unread |= self._calls & self._alive
@@ -121,15 +121,15 @@ class TimeTokenHolder:
         """Send a message to be handled by the other before time advances."""
         self._outbox.append((other, message, event))
 
-    # What comes from others.
+    # Messages of other processes.
 
-    def take(
+    def receive(
         self,
         other: int,
         message: TimeToken | TokenRequest | StateReport | Ordered,
         event: Event | None,
     ) -> None:
-        """Take in a message of another process; raise `WireError` if it counts other processes."""
+        """Handle a message of another process; raise `WireError` if it counts other processes."""
         count = len(self._keys)
         match message:
             case TimeToken():
@@ -147,10 +147,10 @@ class TimeTokenHolder:
             case _:
                 self._received[other] += 1
                 self._inbox.append((other, message, event))
-        self._begin()
+        self._accept_turn()
 
-    def _begin(self) -> None:
-        """Take the passed turn once all messages sent before have arrived."""
+    def _accept_turn(self) -> None:
+        """Accept the passed turn once all messages sent before have arrived."""
         turn = self._next
         if turn is None or any(
             self._received[other] < turn.sent[other][self._me] for other in self._alive - {self._me}
@@ -164,7 +164,7 @@ class TimeTokenHolder:
         self._sent = [list(row) for row in turn.sent]
         self._keys = list(turn.keys)
         self._unread = set(turn.unread) - {self._me}
-        self._others = min(self._keys[n] for n in self._alive - {self._me})
+        self._next_elsewhere = min(self._keys[n] for n in self._alive - {self._me})
         self._timeline.move(turn.now, turn.orders)
         inbox, self._inbox = sorted(self._inbox, key=lambda item: item[1].serial), []
         for other, message, event in inbox:
@@ -180,7 +180,7 @@ class TimeTokenHolder:
         self._timeline.move(self._timeline.now, (schedule, order + len(outbox)))
 
     def _pass(self, key: Key) -> None:
-        """Give the turn to a process with something to receive, or else with the next thing due."""
+        """Pass the turn to a process with something to receive, or else with the next thing due."""
         others = self._alive - {self._me}
         self._reported_key = self._keys[self._me] = key
         if waiting := self._unread & others:
@@ -242,4 +242,4 @@ class TimeTokenHolder:
             unread=tuple(sorted(self._alive)),
             sent=tuple(tuple(row) for row in sent),
         )
-        self._begin()
+        self._accept_turn()
