@@ -53,8 +53,8 @@ _HOLDS = {
 }  # values of these that hold here; so do 0, false and an empty text of all
 
 
-def parse(text: str, where: str) -> tuple[dict[str, Any], str, list[str]]:
-    """Parse JSON with comments, trailing commas, NaN and infinities; errors begin with `where`.
+def parse(text: str, file_name: str) -> tuple[dict[str, Any], str, list[str]]:
+    """Parse JSON with comments, trailing commas, NaN and infinities; errors name the file.
 
     Returns:
         Its values; the text as strict JSON; notes on what AirSim would not have taken.
@@ -90,13 +90,15 @@ def parse(text: str, where: str) -> tuple[dict[str, Any], str, list[str]]:
             strict = json.dumps(table, ensure_ascii=False)
         json.dumps(table, ensure_ascii=False).encode()
     except UnicodeEncodeError:
-        raise ConfigError(f"{where}: expected Unicode, found half a surrogate pair") from None
+        raise ConfigError(f"{file_name}: expected Unicode, found half a surrogate pair") from None
     except RecursionError:
-        raise ConfigError(f"{where}: expected objects and lists less deep in one another") from None
+        raise ConfigError(
+            f"{file_name}: expected objects and lists less deep in one another"
+        ) from None
     except ValueError as error:
-        raise ConfigError(_printable(f"{where}: expected JSON, found: {error}")) from None
+        raise ConfigError(_printable(f"{file_name}: expected JSON, found: {error}")) from None
     if not isinstance(table, dict):
-        raise ConfigError(f"{where}: expected an object {{…}}, found {strict.strip()!r:.80}")
+        raise ConfigError(f"{file_name}: expected an object {{…}}, found {strict.strip()!r:.80}")
     return table, strict, notes
 
 
@@ -112,7 +114,7 @@ class Keys:
         self._table = table
         self._path = path
         self._notes = notes
-        self._asked: list[str] = []
+        self._read_keys: list[str] = []
 
     def __contains__(self, key: str) -> bool:
         return key in self._table
@@ -148,11 +150,13 @@ class Keys:
         """Return our `position` and `orientation`; the arguments replace missing numbers."""
         pose: dict[str, Any] = {}
         places = (("position", "X Y Z", position), ("orientation", "Roll Pitch Yaw", orientation))
-        for ours, keys, usual in places:
-            given = self.numbers(keys, math.nan)
-            if not all(map(math.isnan, given)):
-                pairs = zip(given, usual, strict=True)
-                pose[ours] = [other if math.isnan(number) else number for number, other in pairs]
+        for field, keys, usual in places:
+            numbers = self.numbers(keys, math.nan)
+            if not all(map(math.isnan, numbers)):
+                pairs = zip(numbers, usual, strict=True)
+                pose[field] = [
+                    default if math.isnan(number) else number for number, default in pairs
+                ]
         return pose
 
     def flag(self, key: str, default: bool = False) -> bool:
@@ -183,15 +187,15 @@ class Keys:
             yield inner.table(name)
 
     def done(self) -> None:
-        """Note each key never asked for, unless its value holds anyway."""
+        """Add a note for each key never read, unless its value has no effect here."""
         for key, value in self._table.items():
             so_anyway = key in IGNORED and (not value or value != value or value == _HOLDS.get(key))
-            if key not in self._asked and not so_anyway:
-                unknown = f"no such setting is known{suggest(key, self._asked)}"
-                self.note(key, f"ignored: {IGNORED.get(key, unknown)}")
+            if key not in self._read_keys and not so_anyway:
+                unknown = f"no such setting is known{suggest(key, self._read_keys)}"
+                self.add_note(key, f"ignored: {IGNORED.get(key, unknown)}")
 
-    def note(self, key: str, text: str) -> None:
-        """Note something about a key, or about the whole if the key is empty."""
+    def add_note(self, key: str, text: str) -> None:
+        """Add a note about a key, or about the whole object if the key is empty."""
         self._notes.append(_printable(f"{self._at(key)}: {text}"))
 
     def error(self, key: str, text: str) -> ConfigError:
@@ -199,7 +203,7 @@ class Keys:
         return ConfigError(_printable(f"{self._at(key)}: {text}"))
 
     def _get(self, key: str, type_: Any, expected: str) -> Any:
-        self._asked.append(key)
+        self._read_keys.append(key)
         value = self._table.get(key)
         if value is None or (
             isinstance(value, type_) and isinstance(value, bool) == (type_ is bool)

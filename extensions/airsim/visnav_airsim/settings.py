@@ -94,10 +94,10 @@ def _configuration(keys: Keys, text: str, world: str) -> Table:
         raise keys.error("SimMode", f'expected "Multirotor" or "{_CAMERA}", found {mode!r:.80}')
     version = keys.number("SettingsVersion", keys.number("SettingdVersion", 1.2))
     if version < 1.2:
-        keys.note("SettingsVersion", f"{version:g} is read as if it were 1.2")
+        keys.add_note("SettingsVersion", f"{version:g} is read as if it were 1.2")
     speed = keys.positive("ClockSpeed", 1.0)
     if speed > 1.0 and speed != int(speed):
-        keys.note("ClockSpeed", f"AirSim takes {speed:g} as {int(speed)}; here it is {speed:g}")
+        keys.add_note("ClockSpeed", f"AirSim takes {speed:g} as {int(speed)}; here it is {speed:g}")
     server: Table = {
         "name": "airsim",
         "type": "AirsimServer",
@@ -129,16 +129,16 @@ def _vehicles(keys: Keys, mode: str, world: str, server: Table) -> list[Table]:
     defaults = {"Latitude": 47.641468, "Longitude": -122.140165, "Altitude": 122.0}
     origin = [point.number(key, default) for key, default in defaults.items()]
     point.done()
-    given = list(keys.tables("Vehicles"))
-    if not given:
+    tables = list(keys.tables("Vehicles"))
+    if not tables:
         name = _CAMERA if mode == _CAMERA else _DRONE
-        given = [(name, Keys({"VehicleType": name}, "", []))]
+        tables = [(name, Keys({"VehicleType": name}, "", []))]
     nodes: list[Table] = []
-    for name, vehicle in given:
+    for name, vehicle in tables:
         camera = _is_camera(vehicle, mode)
         node = {"name": name, **_place(vehicle, camera), "world": world, "origin": origin}
         if camera:
-            _note_sensors(vehicle, keys)
+            _add_sensor_notes(vehicle, keys)
         else:
             node |= _sensors(vehicle, keys, server)
         served = _cameras(name, vehicle, keys, camera)
@@ -151,7 +151,7 @@ def _vehicles(keys: Keys, mode: str, world: str, server: Table) -> list[Table]:
     places = [(node["position"], node.get("height")) for node in nodes]
     for node, place in zip(nodes, places, strict=True):
         if places.count(place) > 1:
-            keys.note(f"Vehicles.{node['name']}", "another vehicle starts at the same place")
+            keys.add_note(f"Vehicles.{node['name']}", "another vehicle starts at the same place")
     if not nodes:
         raise keys.error("Vehicles", "expected one with AutoCreate at least, found none")
     return nodes
@@ -165,7 +165,7 @@ def _is_camera(vehicle: Keys, mode: str) -> bool:
             "VehicleType", f'expected "{_DRONE}" or "{_CAMERA}", found {type_!r:.80}{reason}'
         )
     if mode == _CAMERA and folded != mode.casefold():
-        vehicle.note("VehicleType", f"in the mode {_CAMERA} it is a camera that does not fly")
+        vehicle.add_note("VehicleType", f"in the mode {_CAMERA} it is a camera that does not fly")
     return mode == _CAMERA or folded == _CAMERA.casefold()
 
 
@@ -183,10 +183,10 @@ def _place(vehicle: Keys, camera: bool) -> Table:
 
 def _recording(keys: Keys) -> Table:
     """Return the server's setting; recordings stay in the run's folder."""
-    given = keys.text("Folder") or "recording"
-    folder = re.sub(r"[^\w-]", "_", PurePath(given).name, flags=re.ASCII) or "recording"
-    if folder != given:
-        keys.note("Folder", f'it is "{folder}" in the run\'s folder')
+    folder_name = keys.text("Folder") or "recording"
+    folder = re.sub(r"[^\w-]", "_", PurePath(folder_name).name, flags=re.ASCII) or "recording"
+    if folder != folder_name:
+        keys.add_note("Folder", f'it is "{folder}" in the run\'s folder')
     recording: Table = {
         "enabled": keys.flag("Enabled"),
         "on_move": keys.flag("RecordOnMove"),
@@ -225,11 +225,13 @@ def _cameras(vehicle_name: str, vehicle: Keys, settings: Keys, free: bool) -> li
         cameras[name] = {**mount, "captures": list(captures.values())}
         looks = {(c["width"], c["height"], c["fov"]) for c in captures.values()}
         if len(looks) > 1:
-            keys.note("CaptureSettings", "the types of image differ in size or field of view")
+            keys.add_note("CaptureSettings", "the types of image differ in size or field of view")
         elif 0 in captures and not {1, 2, 3} & set(captures):
-            keys.note("CaptureSettings", "depth, which is not listed, has 256×144 pixels of 90°")
+            keys.add_note(
+                "CaptureSettings", "depth, which is not listed, has 256×144 pixels of 90°"
+            )
         keys.done()
-    defaults.mount()  # known, even if no camera asks for it
+    defaults.mount()  # read, even if no camera uses it
     defaults.done()
     return [{"name": name, "vehicle": vehicle_name, **camera} for name, camera in cameras.items()]
 
@@ -245,13 +247,13 @@ def _captures(keys: Keys) -> dict[int, Table]:
         if projection.casefold() != "perspective":
             raise entry.error("ProjectionMode", f'expected "perspective", found {projection!r:.80}')
         if type_ not in _IMAGE_TYPES:
-            entry.note("ImageType", f"ignored: no images of type {type_} are taken")
+            entry.add_note("ImageType", f"ignored: no images of type {type_} are taken")
         entry.done()
     for entry in keys.entries("NoiseSettings"):
         if entry.flag("Enabled"):
-            entry.note("", "ignored: images on demand are without errors")
+            entry.add_note("", "ignored: images on demand are without errors")
     if keys.table("Gimbal").number("Stabilization", 0.0):
-        keys.note("Gimbal", "ignored: cameras turn with their vehicle")
+        keys.add_note("Gimbal", "ignored: cameras turn with their vehicle")
     return {type_: capture for type_, capture in captures.items() if type_ in _IMAGE_TYPES}
 
 
@@ -266,57 +268,57 @@ def _sensors(vehicle: Keys, settings: Keys, server: dict[str, Any]) -> dict[str,
         builtin = ({"SensorType": type_, "Enabled": True} for type_ in (1, 2, 3, 4))
         usual = (("", Keys(table, "", [])) for table in builtin)
         server["sensor_names"]["gps"] = "gnss"
-    listed = list(_known(vehicle.tables("Sensors")))
+    listed = list(_known_types(vehicle.tables("Sensors")))
     types = {type_ for _, _, type_ in listed}
     sensors: dict[str, Any] = {}
-    for name, keys, type_ in [*listed, *(s for s in _known(usual) if s[2] not in types)]:
+    for name, keys, type_ in [*listed, *(s for s in _known_types(usual) if s[2] not in types)]:
         setting, enabled = _SETTINGS[type_], keys.flag("Enabled")
         if "Enabled" not in keys:
-            keys.note("", "ignored: a sensor is off unless Enabled is true")
+            keys.add_note("", "ignored: a sensor is off unless Enabled is true")
         elif enabled and type_ >= 5:
-            ours = re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
+            node_name = re.sub(r"\W", "_", name, flags=re.ASCII) or "_"
             if type_ == 6 and (frame := keys.text("DataFrame")):
                 server["lidar_frame"] = frame
-            sensors.setdefault(setting, []).append({"name": ours} | _sensor(keys, type_))
-            server["sensor_names"][name] = ours
+            sensors.setdefault(setting, []).append({"name": node_name} | _sensor(keys, type_))
+            server["sensor_names"][name] = node_name
         elif enabled and setting not in sensors:
             sensors[setting] = _sensor(keys, type_)
             server["sensor_names"][name] = setting
         elif enabled:
-            keys.note("", f"ignored: a vehicle has one {setting}")
+            keys.add_note("", f"ignored: a vehicle has one {setting}")
     return {"imu": _imu(Keys({}, "", []))} | sensors  # it always has one
 
 
-def _note_sensors(vehicle: Keys, settings: Keys) -> None:
-    """Note the sensors that a camera without a vehicle would have, and has not."""
+def _add_sensor_notes(vehicle: Keys, settings: Keys) -> None:
+    """Add notes for sensors that a camera without a vehicle does not have."""
     for keys, key in ((vehicle, "Sensors"), (settings, "DefaultSensors")):
         names = [name for name, sensor in keys.tables(key) if sensor.flag("Enabled")]
         if names:
-            keys.note(
+            keys.add_note(
                 key,
                 f"ignored: {', '.join(names)}: a vehicle of the type {_CAMERA} has cameras and no "
                 f"other sensor, as in AirSim 1.8.1; one of the type {_DRONE} has them",
             )
 
 
-def _known(listed: Iterable[tuple[str, Keys]]) -> Iterable[tuple[str, Keys, int]]:
+def _known_types(listed: Iterable[tuple[str, Keys]]) -> Iterable[tuple[str, Keys, int]]:
     for name, keys in listed:
         if (type_ := keys.whole("SensorType", 0)) in _SETTINGS:
             yield name, keys, type_
         else:
             called = f" ({_COSYS[type_]})" if type_ in _COSYS else ""
-            keys.note("SensorType", f"ignored: no sensor of type {type_}{called} is simulated")
+            keys.add_note("SensorType", f"ignored: no sensor of type {type_}{called} is simulated")
 
 
 def _sensor(keys: Keys, type_: int) -> dict[str, Any]:
     sensor: dict[str, Any] = {**_DIFFERENT.get(type_, {}), **keys.mount()}
     common = {"UpdateFrequency": "rate"} if type_ not in {2, 6} else {}
-    for key, ours in (_NUMBERS.get(type_, {}) | common).items():
+    for key, setting in (_NUMBERS.get(type_, {}) | common).items():
         if (value := keys.number(key, None)) is not None:
-            sensor[ours] = value * _UNITS.get(key, 1.0)
-    for key, ours in (("UpdateLatency", "latency"), ("StartupDelay", "startup_delay")):
+            sensor[setting] = value * _UNITS.get(key, 1.0)
+    for key, setting in (("UpdateLatency", "latency"), ("StartupDelay", "startup_delay")):
         if type_ != 2 and (value := keys.number(key, None)) is not None:
-            sensor[ours] = f"{value!r}s"
+            sensor[setting] = f"{value!r}s"
     if type_ == 2:
         sensor |= _imu(keys)
     if type_ == 6:
@@ -354,11 +356,11 @@ def _lidar(keys: Keys) -> dict[str, Any]:
                 "MeasurementsPerCycle", f"expected 1 to {_MOST_COLUMNS}, found {columns}"
             )
         if "PointsPerSecond" in keys:
-            keys.note("PointsPerSecond", "ignored: MeasurementsPerCycle is given, too")
+            keys.add_note("PointsPerSecond", "ignored: MeasurementsPerCycle is given, too")
         last = keys.number("HorizontalFOVEnd", 360.0) % 360
     noise = keys.number("MinNoiseStandardDeviation", 0.0) if keys.flag("GenerateNoise") else 0.0
     if noise and keys.number("NoiseDistanceScale", 1.0) != 1.0:
-        keys.note("NoiseDistanceScale", "ignored: the noise is the same at all distances")
+        keys.add_note("NoiseDistanceScale", "ignored: the noise is the same at all distances")
     return {
         "channels": keys.whole("NumberOfChannels", 16),
         "rate": turns,

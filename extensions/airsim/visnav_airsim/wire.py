@@ -185,7 +185,7 @@ class YawMode(msgspec.Struct, frozen=True):
 
 
 class KinematicsState(msgspec.Struct, frozen=True):
-    """How something moves: angular velocity and acceleration in its own frame, all else in NED."""
+    """Motion of a body: angular velocity and acceleration in its own frame, all else in NED."""
 
     position: Vector3r = Vector3r()
     orientation: Quaternionr = Quaternionr()

@@ -22,7 +22,7 @@ from visnav_airsim.server.movables import (
     Holder,
     SpareObject,
     add_movables,
-    have_met,
+    enable_collisions,
     set_free,
     spare_objects,
 )
@@ -193,7 +193,7 @@ def test_a_vehicle_rests_on_what_is_held_and_on_what_is_free() -> None:
     add_movables(scene, "airsim", (SpareObject(asset="Cube"),), ())
     attach_vehicle(scene.spec, "drone", (0.0, 0.0, -2.7), 0.0)
     model = scene.spec.compile()
-    have_met(model)
+    enable_collisions(model)
     simulation = Simulation(model)
     holder = Holder.of(simulation)
     cube = model.body("airsim/Cube_0").id

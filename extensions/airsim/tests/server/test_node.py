@@ -49,7 +49,7 @@ class Tasks:
                 task.set_result(clock.now() / SECOND)
 
         clock.schedule.add(clock.now() + round(seconds * SECOND), Once(end))
-        return self._time.owed(task)
+        return self._time.reply_for(task)
 
     @rpc("now")
     def now(self) -> float:

@@ -119,7 +119,7 @@ def test_a_camera_of_the_file_gives_the_same_bytes(
         qpos[3:7] = math.cos(turn), math.sin(turn), 0.1, 0.0
         frame = frames_of(own, 5, qpos, (spec.name,))[spec.name]
         ids = np.arange(model.ngeom + 1, dtype=np.uint8)
-        colour, depth, numbers, _ = renderer.take(5, qpos, ids, wanted(model, spec, *forms))
+        colour, depth, numbers, _ = renderer.render(5, qpos, ids, wanted(model, spec, *forms))
         assert frame.rgb is not None
         assert frame.depth is not None
         assert frame.segmentation is not None
@@ -134,11 +134,11 @@ def test_a_camera_of_the_file_gives_the_same_bytes(
 def test_lens_and_noise_are_left_out(model: Any, renderer: Renderer) -> None:
     ids = np.zeros(model.ngeom + 1, np.uint8)
     pair = [*wanted(model, LENS, (1, "float"), (0, "rgb")), *wanted(model, CAMERAS[0], (0, "rgb"))]
-    depth, ideal, plain = renderer.take(0, model.qpos0, ids, pair)
+    depth, ideal, plain = renderer.render(0, model.qpos0, ids, pair)
     assert ideal.size == plain.size
     planes = np.diff(1.0 / depths(depth, LENS)[-6:], 2)  # of the floor, without distortion
     assert np.abs(planes).max() < 1e-5
-    assert np.array_equal(ideal, renderer.take(0, model.qpos0, ids, [pair[1]])[0])
+    assert np.array_equal(ideal, renderer.render(0, model.qpos0, ids, [pair[1]])[0])
 
 
 @settings(max_examples=20, deadline=None)
@@ -154,13 +154,13 @@ def test_what_is_drawn_together_is_what_is_drawn_alone(
         requested for spec, *what in chosen for requested in wanted(model, spec, (what[0], what[1]))
     ]
     ids = np.arange(model.ngeom + 1, dtype=np.uint8)
-    together = renderer.take(0, model.qpos0, ids, images)
+    together = renderer.render(0, model.qpos0, ids, images)
     assert len(together) == len(images)
     for image, request in zip(together, images, strict=True):
         pixels = request.eye.spec.width * request.eye.spec.height
         if request.form != "png":
             assert image.size == (5 * pixels + 5 if request.form == "float" else 3 * pixels)
-        (alone,) = renderer.take(0, model.qpos0, ids, [request])
+        (alone,) = renderer.render(0, model.qpos0, ids, [request])
         assert np.array_equal(image, alone)
 
 

@@ -307,7 +307,9 @@ def test_a_contact_that_begins_while_another_lasts_is_told(
     others: list[str] = []
     vehicle = Touching()
     collisions = Collisions({"drone": vehicle}, lambda name: (name, 0))
-    monkeypatch.setattr(collisions, "_take", lambda _, new: others.extend(c.other for c in new))
+    monkeypatch.setattr(
+        collisions, "_handle_contacts", lambda _, new: others.extend(c.other for c in new)
+    )
     for look in looks:
         vehicle.now = {*look.split()}
         collisions.watch()

@@ -53,7 +53,7 @@ class RpcClient(asyncio.Protocol):
                 call.set_exception(self._lost)
 
     def data_received(self, data: bytes) -> None:
-        """Hand replies to whoever waits for them."""
+        """Set the results of the calls that these replies answer."""
         try:
             for message in self._decoder.feed(data):
                 if isinstance(message, wire.Reply):
@@ -103,12 +103,12 @@ class Connection:
         offload, until = self._node.offload, time.monotonic() + seconds
         while True:
             self.close()
-            rest = max(until - time.monotonic(), _AGAIN)
+            remaining = max(until - time.monotonic(), _AGAIN)
             try:
-                opened = await offload(socket.create_connection, self._address, rest)
+                opened = await offload(socket.create_connection, self._address, remaining)
                 loop = asyncio.get_running_loop()
                 _, self._client = await loop.create_connection(RpcClient, sock=opened)
-                await self.call("ping", limit=rest)
+                await self.call("ping", limit=remaining)
                 return
             except OSError:
                 if time.monotonic() > until:
@@ -120,7 +120,7 @@ class Connection:
         if self._client is None:
             raise ConnectionResetError("not connected")
         future = self._client.send(method, *arguments)
-        future.add_done_callback(asyncio.Future.exception)  # lest it be said that nobody looked
+        future.add_done_callback(asyncio.Future.exception)  # marks the exception as retrieved
         return future
 
     async def call(self, method: str, *arguments: Any, limit: float | None = None) -> Any:
@@ -165,8 +165,10 @@ class ImageSet(NamedTuple):
 
 def requests(wanted: Sequence[Wanted], vehicle: str, cosys: bool) -> tuple[Any, ...]:
     """Return the arguments of ``simGetImages`` for images of a single instant."""
-    asked = [ImageRequest(name, _TYPES[kind], kind == "depth", False) for name, kind in wanted]
-    return (asked, vehicle) if cosys else (asked, vehicle, False)
+    image_requests = [
+        ImageRequest(name, _TYPES[kind], kind == "depth", False) for name, kind in wanted
+    ]
+    return (image_requests, vehicle) if cosys else (image_requests, vehicle, False)
 
 
 def decode(responses: Any, wanted: Sequence[Wanted], bgr: bool) -> ImageSet:
@@ -234,7 +236,7 @@ class ImageSource:
         self._socket: socket.socket | None = None
 
     def fetch(self) -> ImageSet | str:
-        """Return a set of images, or why there is none; the next call connects anew if need be."""
+        """Return a set of images, or why there is none; the next call reconnects if needed."""
         try:
             return decode(self._call(), self._wanted, self._bgr)
         except (OSError, wire.WireFormatError) as error:
@@ -252,8 +254,8 @@ class ImageSource:
             self._decoder = wire.Decoder(wire.LONGEST_REPLY)
         id_ = next(self._ids)
         self._socket.sendall(wire.request(id_, "simGetImages", self._arguments))
-        while (rest := until - time.monotonic()) > 0.0:
-            self._socket.settimeout(rest)
+        while (remaining := until - time.monotonic()) > 0.0:
+            self._socket.settimeout(remaining)
             if not (data := self._socket.recv(1 << 20)):
                 raise ConnectionResetError("the server closed the connection")
             for message in self._decoder.feed(data):

@@ -18,7 +18,7 @@ from runtime.time.clock import SECOND
 from sims.world import Addressee
 from visnav_airsim.client import remote
 from visnav_airsim.client.connection import Connection, ImageSet, ImageSource, RpcCallError
-from visnav_airsim.client.remote import FRAME, AirsimClientConfig, Orders, ask
+from visnav_airsim.client.remote import FRAME, AirsimClientConfig, Orders, fetch_remote
 from visnav_airsim.wire import CollisionInfo, ImuData, MultirotorState
 
 T = TypeVar("T")
@@ -55,11 +55,11 @@ class AirsimClient(Node[AirsimClientConfig]):
         self._lockstep = self.clock.kind == "lockstep"
         self.deterministic = self._lockstep  # type: ignore[misc]  # while the server steps exactly
         self.counts: Counter[str] = Counter()  # how often each thing went wrong
-        self._where = config.host, config.port
+        self._address = config.host, config.port
         self._addressee = Addressee(self.name, self.siblings(AirsimClient), self.sources)
         limit = float(config.call_timeout)
-        self._state = Connection(self, self._where, limit)
-        self._commands = Connection(self, self._where, limit)
+        self._state = Connection(self, self._address, limit)
+        self._commands = Connection(self, self._address, limit)
         self._connected = 0  # how often the connections were made
         self._mending = asyncio.Lock()
         self._was_paused = True
@@ -69,31 +69,31 @@ class AirsimClient(Node[AirsimClientConfig]):
         self._orders: Orders | None = None
 
     async def on_startup(self) -> None:
-        """Connect, ask for the server's content, and take a first set of images."""
+        """Connect, and fetch the server's content and a first set of images."""
         if self.checking:
             raise UncheckableError("which cameras there are is known to the server only")
         try:
             await self._connect()
-            await self._look()
+            await self._fetch_content()
         except BaseException as error:
             self._close()
             if isinstance(error, RpcCallError | ValueError | OSError):
-                self.log.fatal("%s:%d: %s", *self._where, error)
+                self.log.fatal("%s:%d: %s", *self._address, error)
             raise
 
-    async def _look(self) -> None:
-        """Ask for everything to announce; a server's first images may take longer."""
+    async def _fetch_content(self) -> None:
+        """Fetch everything to announce; a server's first images may take longer."""
         config = self.config
         call = functools.partial(self._state.call, limit=float(config.start_timeout))
-        self._remote = server = await ask(call, config, self.name, self.log.warning)
+        self._remote = server = await fetch_remote(call, config, self.name, self.log.warning)
         for camera in server.first.resampled:
             self.log.warning("%s: its depth has another size than its image: resampled", camera)
         speed, limit = server.clock_speed, float(config.call_timeout)
         if speed != 1.0 and not self._lockstep:
             self.log.warning("expected a ClockSpeed of 1 in real time, found %g", speed)
-        what = self._where, server.vehicle, server.cosys, server.wanted, limit
+        arguments = self._address, server.vehicle, server.cosys, server.wanted, limit
         self._source: Worker[ImageSource] = await self.worker(
-            ImageSource, *what, timeout=2.0 * limit + 10.0
+            ImageSource, *arguments, timeout=2.0 * limit + 10.0
         )
 
     def announce(self) -> Iterable[ev.Announcement]:
@@ -103,7 +103,7 @@ class AirsimClient(Node[AirsimClientConfig]):
     def check(self) -> Iterable[str]:
         """Return why the server's time cannot be led."""
         peers = (sibling.config for sibling in self.siblings(AirsimClient))
-        if self._lockstep and [(p.host, p.port) for p in peers].count(self._where) > 1:
+        if self._lockstep and [(p.host, p.port) for p in peers].count(self._address) > 1:
             yield "port: expected one AirsimClient for each server in lockstep, found several"
 
     async def run(self) -> None:
@@ -123,24 +123,24 @@ class AirsimClient(Node[AirsimClientConfig]):
         if self._lockstep:
             await self._lead()
         await self._relate()  # now that our clock runs, too
-        self.start(self._repeat(self.config.image_rate, self._take_images))
+        self.start(self._repeat(self.config.image_rate, self._fetch_images))
         self.start(self._repeat(self.config.control_rate, self._obey))
         await self._repeat(self.config.imu_rate, self._read)
 
     @on(ev.Command)
     def commands(self, event: ev.Command) -> None:
-        """Take a command for this vehicle, or log the reason for its refusal."""
-        self._take(event, "commands")
+        """Accept a command for this vehicle, or log the reason for its refusal."""
+        self._handle_order(event, "commands")
 
     @on(ev.Setpoint)
     def setpoints(self, event: ev.Setpoint) -> None:
-        """Take a set-point for this vehicle, or log the reason for its refusal."""
-        self._take(event, "setpoints")
+        """Accept a set-point for this vehicle, or log the reason for its refusal."""
+        self._handle_order(event, "setpoints")
 
-    def _take(self, order: ev.Command | ev.Setpoint, port: str) -> None:
+    def _handle_order(self, order: ev.Command | ev.Setpoint, port: str) -> None:
         if self._orders is None or not self._addressee.obeys(order, port):
             return
-        if refusal := self._orders.take(order):
+        if refusal := self._orders.accept(order):
             self._report(f"{type(order).__name__} refused", refusal)
 
     async def _lead(self) -> None:
@@ -156,7 +156,7 @@ class AirsimClient(Node[AirsimClientConfig]):
                 await self._state.call("simContinueForTime", seconds)
             await self._read()
             if step % images == 0:
-                await self._take_images()
+                await self._fetch_images()
             if step % control == 0:
                 await self._obey()
 
@@ -181,13 +181,13 @@ class AirsimClient(Node[AirsimClientConfig]):
             await self._follow(state.timestamp - self._shift - self.clock.now())
         if sample is not None:
             before = self._newest.get("imu")
-            if event := self._made("imu", sample.time_stamp, remote.imu, sample):
+            if event := self._make_event("imu", sample.time_stamp, remote.imu, sample):
                 longest = 1.5 * SECOND / self.config.imu_rate
                 if before is not None and event.stamp - before > longest:
                     self.counts["gaps between samples of the IMU"] += 1
                 self.imu.send(event)
         if state is not None:
-            odometry = self._made("state", state.timestamp, remote.odometry, state, origin)
+            odometry = self._make_event("state", state.timestamp, remote.odometry, state, origin)
             if odometry is not None:
                 self._pose = odometry
                 self.odometry.send(odometry)
@@ -207,7 +207,7 @@ class AirsimClient(Node[AirsimClientConfig]):
             )
         await self.clock.sleep_until(self.clock.now() + ahead)
 
-    async def _take_images(self) -> None:
+    async def _fetch_images(self) -> None:
         images = await self._source.call_for(0.0, ImageSource.fetch)
         if isinstance(images, str):
             self._report("a set of images is lost", images)
@@ -215,10 +215,10 @@ class AirsimClient(Node[AirsimClientConfig]):
             self._send_images(images)
         contact = await self._ask("simGetCollisionInfo", CollisionInfo, self._remote.vehicle)
         if contact is not None and contact.has_collided and self._pose is not None:
-            known = contact, self._remote.origin, self._pose
-            event = self._made("collision", contact.time_stamp, remote.collision, *known)
-            stands = event is not None and event.normal[2] <= -0.7 and event.speed <= 1.0
-            if event is not None and not stands:
+            arguments = contact, self._remote.origin, self._pose
+            event = self._make_event("collision", contact.time_stamp, remote.collision, *arguments)
+            is_standing = event is not None and event.normal[2] <= -0.7 and event.speed <= 1.0
+            if event is not None and not is_standing:
                 self.vehicle_events.send(event)
 
     def _send_images(self, images: ImageSet) -> None:
@@ -228,8 +228,8 @@ class AirsimClient(Node[AirsimClientConfig]):
             ("rgb", self.images, ev.Image),
         )
         for name, camera in self._remote.cameras.items():
-            known = images.poses[name], self._remote.origin
-            pose = self._made(name, images.stamp, remote.camera_pose, *known)
+            arguments = images.poses[name], self._remote.origin
+            pose = self._make_event(name, images.stamp, remote.camera_pose, *arguments)
             if pose is None:
                 continue
             self.camera_poses.send(pose)
@@ -254,26 +254,28 @@ class AirsimClient(Node[AirsimClientConfig]):
             self._report(method, str(error))
             return None
 
-    def _made(self, kind: str, stamp: int, make: Callable[..., E], *arguments: Any) -> E | None:
+    def _make_event(
+        self, kind: str, stamp: int, make: Callable[..., E], *arguments: Any
+    ) -> E | None:
         """Return an event with the server's stamp; `None` if not new or not valid."""
         stamp -= self._shift
         if stamp <= self._newest.get(kind, -1):
             self.counts[f"{kind}: not newer than the last"] += 1
             return None
-        own = kind in ("imu", "state", "collision")
+        is_body = kind in ("imu", "state", "collision")
         try:
-            event = make(stamp, self.name if own else f"{self.name}/{kind}", *arguments)
+            event = make(stamp, self.name if is_body else f"{self.name}/{kind}", *arguments)
         except (ValueError, TypeError) as error:
             self._report(kind, str(error))
             return None
         self._newest[kind] = stamp
         return event
 
-    def _report(self, what: str, why: str) -> None:
+    def _report(self, fault: str, reason: str) -> None:
         """Count a fault, and log its reason the first time."""
-        self.counts[what] += 1
-        if self.counts[what] == 1:
-            self.log.warning("%s: %s", what, why)
+        self.counts[fault] += 1
+        if self.counts[fault] == 1:
+            self.log.warning("%s: %s", fault, reason)
 
     async def _guarded(self, work: Callable[[], Awaitable[None]]) -> None:
         """Do `work` with the server; reconnect if a connection is lost meanwhile."""
@@ -284,7 +286,7 @@ class AirsimClient(Node[AirsimClientConfig]):
             async with self._mending:
                 while before == self._connected:  # nobody else has seen to it
                     if self.config.on_loss == "stop":
-                        self.log.fatal("the connection to %s:%d is lost: %s", *self._where, error)
+                        self.log.fatal("the connection to %s:%d is lost: %s", *self._address, error)
                     self._report("a connection is lost", str(error))
                     await self._connect()
                     with contextlib.suppress(OSError):
@@ -300,14 +302,14 @@ class AirsimClient(Node[AirsimClientConfig]):
         except OSError as error:
             self.log.fatal(
                 "expected a server of AirSim's at %s:%d within %g s, found none: %s",
-                *self._where,
+                *self._address,
                 seconds,
                 error,
             )
         self._connected += 1
 
     async def on_ready(self) -> None:
-        """Pause the server in lockstep, relate the clocks, take over the vehicle."""
+        """Pause the server in lockstep, relate the clocks, take control of the vehicle."""
         config, call, vehicle = self.config, self._state.call, self._remote.vehicle
         if self._lockstep:
             paused = await call("simIsPaused") is True
@@ -341,8 +343,8 @@ class AirsimClient(Node[AirsimClientConfig]):
 
     async def on_shutdown(self) -> None:
         """Release the vehicle, resume the server's time, and log the counts of faults."""
-        for what, count in sorted(self.counts.items()):
-            self.log.info("%s: %d times", what, count)
+        for fault, count in sorted(self.counts.items()):
+            self.log.info("%s: %d times", fault, count)
         with contextlib.suppress(OSError, RpcCallError):
             if self._orders is not None:
                 vehicle, call = self._remote.vehicle, self._commands.call

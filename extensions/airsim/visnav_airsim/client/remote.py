@@ -121,10 +121,10 @@ class Remote(NamedTuple):
     cameras: dict[str, ev.CameraAnnouncement]  # by their names
 
 
-async def ask(
+async def fetch_remote(
     call: Call, config: AirsimClientConfig, name: str, log: Callable[[str], None]
 ) -> Remote:
-    """Ask a server for everything a node of this name announces.
+    """Fetch from a server everything a node of this name announces.
 
     Raises:
         RpcCallError: The server refused a call.
@@ -138,7 +138,7 @@ async def ask(
         listed = ", ".join(names) or "none"
         raise ValueError(f'vehicle: expected one of the server\'s ({listed}), found "{vehicle}"')
     settings = _read(await call("getSettingsString"), log)
-    own: dict[str, Any] = next((n for n in settings["nodes"] if n["name"] == vehicle), {})
+    vehicle_node: dict[str, Any] = next((n for n in settings["nodes"] if n["name"] == vehicle), {})
     captured = {
         camera["name"]: {capture["image_type"]: capture for capture in camera["captures"]}
         for node in settings["nodes"]
@@ -148,7 +148,7 @@ async def ask(
     state = msgspec.convert(await call("getMultirotorState", vehicle), MultirotorState)
     kinematics = state.kinematics_estimated
     body = pose_of(Pose(kinematics.position, kinematics.orientation))
-    origin = await _origin(call, own, vehicle, cosys, body[0])
+    origin = await _origin(call, vehicle_node, vehicle, cosys, body[0])
     place = odometry(0, name, state, origin)
     announced = ev.VehicleAnnouncement(
         stamp=0,
@@ -160,12 +160,12 @@ async def ask(
         orientation=place.orientation,
     )
     imu = ev.ImuAnnouncement(
-        stamp=0, source=name, rate=config.imu_rate, frame_id=FRAME, **_noise(own)
+        stamp=0, source=name, rate=config.imu_rate, frame_id=FRAME, **_noise(vehicle_node)
     )
     wished = config.cameras or _cameras(captured)
     wanted = tuple((camera.name, kind) for camera in wished for kind in camera.images)
-    taken = await call("simGetImages", *requests(wanted, vehicle, cosys))
-    first = decode(taken, wanted, not cosys)
+    responses = await call("simGetImages", *requests(wanted, vehicle, cosys))
+    first = decode(responses, wanted, not cosys)
     cameras = {}
     for camera in wished:
         reply = await call("simGetCameraInfo", camera.name, vehicle, *(() if cosys else (False,)))
@@ -211,10 +211,14 @@ def _read(text: Any, log: Callable[[str], None]) -> dict[str, Any]:
     return {"run": {"speed": 1.0}, "nodes": []}
 
 
-def _noise(own: dict[str, Any]) -> dict[str, Any]:
-    imu = own.get("imu") or settings.read("{}", "", lambda _: None)["nodes"][0]["imu"]
+def _noise(vehicle_node: dict[str, Any]) -> dict[str, Any]:
+    imu = vehicle_node.get("imu") or settings.read("{}", "", lambda _: None)["nodes"][0]["imu"]
     sensors = ("gyroscope", "accelerometer")
-    names = [f"{sensor}_{what}" for sensor in sensors for what in ("noise_density", "random_walk")]
+    names = [
+        f"{sensor}_{quantity}"
+        for sensor in sensors
+        for quantity in ("noise_density", "random_walk")
+    ]
     return {name: imu.get(name, 0.0) for name in names}
 
 
@@ -228,7 +232,7 @@ def _cameras(captured: dict[str, dict[int, Any]]) -> list[RemoteCamera]:
 
 
 async def _origin(
-    call: Call, own: dict[str, Any], vehicle: str, cosys: bool, local: ev.Vector3
+    call: Call, vehicle_node: dict[str, Any], vehicle: str, cosys: bool, local: ev.Vector3
 ) -> ev.Vector3:
     """Return where a vehicle's local frame is: by where its pawn is, or else by the settings."""
     try:
@@ -238,7 +242,7 @@ async def _origin(
             return x - local[0], y - local[1], z - local[2]
     except (RpcCallError, msgspec.ValidationError):
         pass
-    return (*own.get("position", (0.0, 0.0)), -own.get("height", 0.0))
+    return (*vehicle_node.get("position", (0.0, 0.0)), -vehicle_node.get("height", 0.0))
 
 
 def pose_of(pose: Pose, origin: ev.Vector3 = (0.0, 0.0, 0.0)) -> tuple[ev.Vector3, ev.Quaternion]:
@@ -314,8 +318,8 @@ class Orders:
         self._task: asyncio.Future[Any] | None = None
         """The take-off or landing whose reply is to come."""
 
-    def take(self, order: ev.Command | ev.Setpoint) -> str:
-        """Take an order for the next `obey`; return the reason for refusal, else empty."""
+    def accept(self, order: ev.Command | ev.Setpoint) -> str:
+        """Store an order for the next `obey`; return the reason for refusal, else empty."""
         if isinstance(order, ev.Setpoint):
             allowed, then = {"armed", "flying"}, "flying"
         else:
@@ -364,7 +368,7 @@ class Orders:
             await self._connection.settle()  # if it ended before now, its reply is here then
             if self._task.done():
                 happened += await self._ended(self._task)
-        elif self.phase == "taking off" and _is_there(self._setpoint, pose):
+        elif self.phase == "taking off" and _has_arrived(self._setpoint, pose):
             self.phase = "flying"
             happened.append(ev.TakenOff)
         if self._setpoint is not None and self._task is None:
@@ -377,7 +381,7 @@ class Orders:
         return happened
 
     async def _ended(self, task: asyncio.Future[Any]) -> list[type[ev.VehicleEvent]]:
-        """Go on after a task: stop the motors after a landing."""
+        """Handle the end of a task: stop the motors after a landing."""
         self._task = None
         if self.phase != "landing":
             return []
@@ -386,7 +390,7 @@ class Orders:
         elif task.result() is True:
             self.phase = "disarmed"
             return [ev.Landed, *await self._arm(False)]
-        else:  # somebody else's command came between
+        else:  # another client's command came between
             self._task = self._send("land", _LONGEST_LANDING)
         return []
 
@@ -402,11 +406,11 @@ class Orders:
         """Send a task; its reply comes at its end, and an error goes to `refused`."""
         task = self._connection.send(method, *arguments, self._vehicle)
 
-        def note(done: asyncio.Future[Any]) -> None:
+        def report_error(done: asyncio.Future[Any]) -> None:
             if isinstance(error := done.exception(), RpcCallError):
                 self._refused(f"{method}: {error}")
 
-        task.add_done_callback(note)
+        task.add_done_callback(report_error)
         return task
 
 
@@ -414,9 +418,9 @@ def move(setpoint: ev.Setpoint, pose: ev.Odometry, duration: float) -> tuple[Any
     """Return method and arguments, without the vehicle's name, to follow a set-point (s)."""
     match setpoint:
         case ev.PositionSetpoint():
-            apart = [a - b for a, b in zip(setpoint.position, pose.position, strict=True)]
-            pull = _PULL * min(1.0, _FASTEST / max(_PULL * math.hypot(*apart), 1e-9))
-            velocity = [f + pull * d for f, d in zip(setpoint.velocity, apart, strict=True)]
+            difference = [a - b for a, b in zip(setpoint.position, pose.position, strict=True)]
+            pull = _PULL * min(1.0, _FASTEST / max(_PULL * math.hypot(*difference), 1e-9))
+            velocity = [f + pull * d for f, d in zip(setpoint.velocity, difference, strict=True)]
             mode = YawMode(False, math.degrees(setpoint.yaw))
             return ("moveByVelocity", *velocity, duration, 0, mode)
         case ev.VelocitySetpoint():
@@ -435,7 +439,7 @@ def move(setpoint: ev.Setpoint, pose: ev.Odometry, duration: float) -> tuple[Any
     raise ValueError(f"{type(setpoint).__name__} is no set-point of a multirotor")
 
 
-def _is_there(setpoint: ev.Setpoint | None, pose: ev.Odometry) -> bool:
+def _has_arrived(setpoint: ev.Setpoint | None, pose: ev.Odometry) -> bool:
     assert isinstance(setpoint, ev.PositionSetpoint)
     velocity = rotate(pose.orientation, pose.linear_velocity)
     return abs(setpoint.position[2] - pose.position[2]) < 0.1 and math.hypot(*velocity) < 0.2

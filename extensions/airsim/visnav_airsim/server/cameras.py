@@ -94,26 +94,26 @@ class ServedCamera(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class Camera(msgspec.Struct):
-    """Camera of clients: its true calibration, and the one that they are told."""
+    """Camera of clients: its true calibration, and the announced one."""
 
     body: int  # number of the body that carries it
     mount: Mount  # where on it
     # How it takes images, by their type; those of other types as type -1.
     specs: dict[int, CameraSpec]
     errs: bool = False  # whether its announced calibration has errors
-    told_mount: Mount | None = None  # in place of `mount`
-    told_intrinsics: Intrinsics | None = None  # in place of those of `specs`
+    announced_mount: Mount | None = None  # in place of `mount`
+    announced_intrinsics: Intrinsics | None = None  # in place of those of `specs`
 
     def eye(self, image_type: int) -> Eye:
         """Return the eye for images of a type."""
         return Eye(self.body, self.mount, self.specs.get(image_type, self.specs[-1]))
 
-    def told(self, image_type: int) -> Eye:
-        """Return the eye for images of a type with the calibration that clients are told."""
+    def announced_eye(self, image_type: int) -> Eye:
+        """Return the eye for images of a type with the announced calibration."""
         body, mount, spec = self.eye(image_type)
-        if self.told_intrinsics is not None:
-            spec = msgspec.structs.replace(spec, intrinsics=self.told_intrinsics)
-        return Eye(body, self.told_mount or mount, spec)
+        if self.announced_intrinsics is not None:
+            spec = msgspec.structs.replace(spec, intrinsics=self.announced_intrinsics)
+        return Eye(body, self.announced_mount or mount, spec)
 
 
 class Cameras:
@@ -133,22 +133,24 @@ class Cameras:
     ) -> None:
         self._model, self._drawn_state = model, drawn_state
         self._named: dict[str, dict[str, Camera]] = {}
-        known = {carrier.name for carrier in carriers}
+        vehicles = {carrier.name for carrier in carriers}
         for entry in entries:
-            if entry.vehicle not in {"", *known}:
+            if entry.vehicle not in {"", *vehicles}:
                 raise ValueError(
-                    f"cameras: {entry.name}: vehicle: expected {' or '.join(sorted(known))}, "
+                    f"cameras: {entry.name}: vehicle: expected {' or '.join(sorted(vehicles))}, "
                     f'or "" for all, found "{entry.vehicle}"'
                 )
         for carrier in carriers:
             free = not carrier.node.vehicle
             body = model.body(carrier.name if free else f"{carrier.name}/base_link").id
-            own = [entry for entry in entries if entry.vehicle in {"", carrier.name}]
-            named = cameras_by_name(carrier.config.cameras, own, body, free)
+            carrier_entries = [entry for entry in entries if entry.vehicle in {"", carrier.name}]
+            named = cameras_by_name(carrier.config.cameras, carrier_entries, body, free)
             self._named[carrier.name] = named
             for names, _, _ in DEFAULT_CAMERAS:
-                if given := {e.name for e in (*own, *carrier.config.cameras)} & set(names):
-                    log.info("%s: %s are one camera, %s", carrier.name, names, min(given))
+                if shared_names := {
+                    e.name for e in (*carrier_entries, *carrier.config.cameras)
+                } & set(names):
+                    log.info("%s: %s are one camera, %s", carrier.name, names, min(shared_names))
         cameras = (camera for named in self._named.values() for camera in named.values())
         specs = [spec for camera in cameras for spec in camera.specs.values()]
         self.largest = tuple(camera_info(spec) for spec in specs)
@@ -159,18 +161,18 @@ class Cameras:
             raise RpcError("not supported by visnav-runtime: external cameras")
         named = self._named[vehicle.name]
         if name not in named:
-            names = ", ".join(f"'{known}'" for known in sorted(named))
+            names = ", ".join(f"'{other}'" for other in sorted(named))
             raise RpcError(f"expected a camera of {vehicle.name} ({names}), found '{name}'")
         return named[name]
 
     def announced(self, announcement: CameraAnnouncement) -> None:
-        """Take note of the announced calibration of a camera, if it has errors."""
+        """Store the announced calibration of a camera, if it has errors."""
         vehicle, _, name = announcement.source.partition("/")
         camera = self._named.get(vehicle, {}).get(name)
         if camera is not None and camera.errs:
             turn = multiply(announcement.orientation, inverse(OPTICAL_TO_FRD))
-            camera.told_mount = announcement.position, turn
-            camera.told_intrinsics = (
+            camera.announced_mount = announcement.position, turn
+            camera.announced_intrinsics = (
                 announcement.info.fx,
                 announcement.info.fy,
                 announcement.info.cx,
@@ -190,7 +192,7 @@ class Cameras:
     @rpc("simGetCameraInfo", cosys=2)
     def info(self, camera: str, vehicle: ServedVehicle, external: bool = False) -> wire.CameraInfo:
         """Return pose, field of view and projection of a camera's scene images, as announced."""
-        eye = self.find(vehicle, camera, external).told(0)
+        eye = self.find(vehicle, camera, external).announced_eye(0)
         info = camera_info(eye.spec)
         tangent, longer = info.width / (2.0 * info.fx), max(info.width, info.height)
         across, down = (longer / (side * tangent) for side in (info.width, info.height))
@@ -212,7 +214,7 @@ class Cameras:
         if not (all(abs(number) <= FARTHEST for number in (*position, *turn)) and any(turn)):
             raise RpcError(f"expected a rotation, and numbers up to {FARTHEST:g}, found {pose}")
         target = self.find(vehicle, camera, external)
-        target.mount, target.told_mount = (position, normalize(turn)), None
+        target.mount, target.announced_mount = (position, normalize(turn)), None
 
     @rpc("simSetCameraFov", cosys=3)
     def set_fov(
@@ -222,7 +224,7 @@ class Cameras:
         if not 1.0 <= degrees <= 170.0:
             raise RpcError(f"expected a field of view of 1 to 170 degrees, found {degrees}")
         target = self.find(vehicle, camera, external)
-        target.told_intrinsics = None
+        target.announced_intrinsics = None
         target.specs = {
             kind: msgspec.structs.replace(spec, fov=degrees, intrinsics=None)
             for kind, spec in target.specs.items()
@@ -231,7 +233,7 @@ class Cameras:
     @rpc("simGetCurrentFieldOfView", cosys=2)
     def field_of_view(self, camera: str, vehicle: ServedVehicle, external: bool = False) -> str:
         """Return the fields of view of a camera's scene images in words, degrees, as announced."""
-        info = camera_info(self.find(vehicle, camera, external).told(0).spec)
+        info = camera_info(self.find(vehicle, camera, external).announced_eye(0).spec)
         across, down = (
             math.degrees(2.0 * math.atan(pixels / (2.0 * focal_length)))
             for pixels, focal_length in ((info.width, info.fx), (info.height, info.fy))
@@ -269,17 +271,17 @@ def cameras_by_name(
     Raises:
         ValueError: Two entries have one name.
     """
-    given = {eye.name: camera_of_file(eye, body) for spec in files for eye in eyes(spec)}
-    named = {entry.name: _of_entry(entry, body, free) for entry in entries}
+    listed = {eye.name: camera_of_file(eye, body) for spec in files for eye in eyes(spec)}
+    named = {entry.name: _entry_camera(entry, body, free) for entry in entries}
     if len(named) < len(entries):
         repeated = sorted(entry.name for entry in entries)
         raise ValueError(f"cameras: expected names of their own on a vehicle, found {repeated}")
-    given |= named
-    cameras = given.copy()
+    listed |= named
+    cameras = listed.copy()
     for names, _, _ in DEFAULT_CAMERAS:
-        first = next((given[name] for name in names if name in given), None)
-        camera = first or _of_entry(ServedCamera(name=names[0]), body, free)
-        cameras |= {name: camera for name in names if name not in given}
+        first = next((listed[name] for name in names if name in listed), None)
+        camera = first or _entry_camera(ServedCamera(name=names[0]), body, free)
+        cameras |= {name: camera for name in names if name not in listed}
     return cameras
 
 
@@ -301,7 +303,7 @@ def camera_of_file(spec: CameraSpec, body: int) -> Camera:
     )
 
 
-def _of_entry(entry: ServedCamera, body: int, free: bool) -> Camera:
+def _entry_camera(entry: ServedCamera, body: int, free: bool) -> Camera:
     position, orientation = default_mount(entry.name, free)
     mount = _mount(entry.position or position, entry.orientation or orientation)
     captures = {-1: Capture()} | {c.image_type: c for c in entry.captures}
@@ -350,7 +352,7 @@ class Images:
         self._starting = asyncio.Lock()
         self._idle = asyncio.Semaphore(processes)
         self._waiting = 0
-        self._told = False
+        self._warned = False
 
     async def start(self) -> None:
         """Start the renderer, unless already started."""
@@ -377,7 +379,7 @@ class Images:
         external: bool = False,
     ) -> Awaitable[msgspec.Raw]:
         """Return images of a single instant: a common stamp, and the cameras' poses then."""
-        return self.take(requests, vehicle, caller.flavour, external=external)
+        return self.capture(requests, vehicle, caller.flavour, external=external)
 
     @rpc("simGetImage")
     def get_image(
@@ -393,9 +395,9 @@ class Images:
         self._cameras.find(vehicle, camera, external)
         requests = [wire.ImageRequest(camera, image_type)]
         if image_type not in ImageType.__members__.values():
-            if not self._told:
+            if not self._warned:
                 self._node.log.warning("simGetImage: %s", _not_drawn(image_type))
-            self._told, requests = True, []
+            self._warned, requests = True, []
         exposure = self._expose(requests, vehicle, caller.flavour)
 
         async def png() -> bytes:
@@ -406,7 +408,7 @@ class Images:
 
         return png()
 
-    def take(
+    def capture(
         self,
         requests: Sequence[wire.ImageRequest],
         vehicle: ServedVehicle,
@@ -414,7 +416,7 @@ class Images:
         *,
         external: bool = False,  # whether cameras that no vehicle carries are meant: there are none
     ) -> Awaitable[msgspec.Raw]:
-        """Take images of the state at the call, or raise `RpcError`; time goes on.
+        """Capture images of the state at the call, or raise `RpcError`; time continues.
 
         Returns:
             Awaitable of the structures, encoded.
@@ -444,12 +446,12 @@ class Images:
             exposure.wanted.append(Wanted(eye, ImageType(request.image_type), form))
             if request.camera_name not in poses:
                 poses[request.camera_name] = self._cameras.pose(
-                    vehicle, camera.told(request.image_type), qpos
+                    vehicle, camera.announced_eye(request.image_type), qpos
                 )
             pose = poses[request.camera_name]
             width, height = eye.spec.width, eye.spec.height
             length += width * height * (5 if form == "float" else 3)
-            known: dict[str, Any] = {
+            fields: dict[str, Any] = {
                 "camera_name": request.camera_name,
                 "image_type": request.image_type,
                 "pixels_as_float": request.pixels_as_float,
@@ -461,9 +463,9 @@ class Images:
                 "height": height,
             }
             exposure.responses.append(
-                wire.ImageResponse(**known)
+                wire.ImageResponse(**fields)
                 if flavour == "airsim"
-                else wire.CosysImageResponse(**known, annotation_name=request.annotation_name)
+                else wire.CosysImageResponse(**fields, annotation_name=request.annotation_name)
             )
         if length > LONGEST:
             raise RpcError(f"expected images of at most {LONGEST} bytes, found {length}")

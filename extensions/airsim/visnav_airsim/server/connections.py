@@ -62,7 +62,7 @@ class Incidents:
     def log_counts(self) -> None:
         """Log how often each thing happened."""
         if self.counts:
-            counts = (f"{count} {what}" for what, count in self.counts.items())
+            counts = (f"{count} {incident}" for incident, count in self.counts.items())
             self._log.info("AirSim's clients: %s", ", ".join(counts))
 
 
@@ -91,7 +91,7 @@ class Connection:
         self._tasks: set[asyncio.Task[Any]] = set()
         self._unsent: deque[memoryview] = deque()
         self._is_closed = False
-        self._heard, self._spoke = time.monotonic(), False
+        self._last_request_at, self._has_requested = time.monotonic(), False
         client.setblocking(False)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -104,7 +104,7 @@ class Connection:
         """Return the real seconds since the connection became spare; negative in use."""
         if self._open or self._unsent:
             return -1.0
-        return time.monotonic() - self._heard - (IDLE if self._spoke else SILENT)
+        return time.monotonic() - self._last_request_at - (IDLE if self._has_requested else SILENT)
 
     def close(self, reason: str = "") -> None:
         """Close the connection and cancel its calls, not vehicles' tasks; log a `reason`."""
@@ -146,7 +146,7 @@ class Connection:
             self.close(str(error))
 
     def _serve(self, request: wire.Request) -> None:
-        self._heard, self._spoke = time.monotonic(), True
+        self._last_request_at, self._has_requested = time.monotonic(), True
         self._incidents.counts["requests" if request.id is not None else "notifications"] += 1
         try:
             if self._open >= OPEN_REQUESTS:

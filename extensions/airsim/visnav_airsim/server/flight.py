@@ -98,7 +98,7 @@ class Control:
     @rpc("simSetVehiclePose")
     def set_vehicle_pose(self, pose: Pose, ignore_collision: bool, vehicle: ServedVehicle) -> None:  # noqa: ARG002
         """Set a pose, at rest, despite obstacles; in flight, hold the place. NaN keeps a value."""
-        self._put(vehicle, KinematicsState(pose.position, pose.orientation))
+        self._set_state(vehicle, KinematicsState(pose.position, pose.orientation))
 
     @rpc("simSetKinematics")
     def set_kinematics(
@@ -108,15 +108,15 @@ class Control:
         vehicle: ServedVehicle,
     ) -> None:
         """Set pose and velocities; the physics gives accelerations. NaN keeps the present value."""
-        self._put(vehicle, state)
+        self._set_state(vehicle, state)
 
     @rpc("simAddVehicle")
     def add_vehicle(self, name: str, vehicle_type: str, pose: Pose, pawn_path: str) -> bool:  # noqa: ARG002
         """Return ``False``: the vehicles of a run are those of its file."""
         return False
 
-    def _put(self, vehicle: ServedVehicle, wanted: KinematicsState) -> None:
-        state = _merged(vehicle, wanted)
+    def _set_state(self, vehicle: ServedVehicle, target: KinematicsState) -> None:
+        state = _merged(vehicle, target)
         if isinstance(vehicle, ServedMultirotor):
             order = partial(
                 Teleport,
@@ -148,20 +148,20 @@ class Control:
             self._tasks.order(vehicle, Arm)
 
 
-def _merged(vehicle: ServedVehicle, wanted: KinematicsState) -> State:
-    """Return a wanted state in ``map``; NaN is replaced by the vehicle's present state."""
+def _merged(vehicle: ServedVehicle, target: KinematicsState) -> State:
+    """Return a target state in ``map``; NaN is replaced by the vehicle's present state."""
     now = vehicle.state()
-    orientation = astuple(wanted.orientation)
+    orientation = astuple(target.orientation)
     return State(
-        _kept(vehicle.in_map(wanted.position), now.position),
+        _or_present(vehicle.in_map(target.position), now.position),
         now.orientation if any(map(isnan, orientation)) else normalize(orientation),
-        _kept(astuple(wanted.linear_velocity), now.velocity),
-        _kept(astuple(wanted.angular_velocity), now.angular_velocity),
+        _or_present(astuple(target.linear_velocity), now.velocity),
+        _or_present(astuple(target.angular_velocity), now.angular_velocity),
     )
 
 
-def _kept(wanted: Vector3, present: Vector3) -> Vector3:
-    x, y, z = (b if isnan(a) else a for a, b in zip(wanted, present, strict=True))
+def _or_present(target: Vector3, present: Vector3) -> Vector3:
+    x, y, z = (b if isnan(a) else a for a, b in zip(target, present, strict=True))
     return x, y, z
 
 
@@ -333,8 +333,8 @@ class Flight:
         vehicle: Commanded,
     ) -> Reply:
         """Fly straight to a position; end within 0.5 m of the position."""
-        how = velocity, timeout, drivetrain, yaw_mode, lookahead, adaptive, vehicle
-        return self.on_path([Corner(x, y, z)], *how)
+        arguments = velocity, timeout, drivetrain, yaw_mode, lookahead, adaptive, vehicle
+        return self.on_path([Corner(x, y, z)], *arguments)
 
     @rpc("moveToZ")
     def to_height(
@@ -349,8 +349,8 @@ class Flight:
     ) -> Reply:
         """Fly straight up or down to a height."""
         place = vehicle.local(vehicle.state().position)
-        how = velocity, timeout, 0, yaw_mode, lookahead, adaptive, vehicle
-        return self.on_path([Corner(place.x_val, place.y_val, z)], *how)
+        arguments = velocity, timeout, 0, yaw_mode, lookahead, adaptive, vehicle
+        return self.on_path([Corner(place.x_val, place.y_val, z)], *arguments)
 
     @rpc("moveToGPS")
     def to_place_on_earth(
@@ -376,8 +376,8 @@ class Flight:
                 "{:.6f}, {:.6f}, {:g} m".format(*vehicle.config.origin)
             )
         corner = Corner(*astuple(vehicle.local(place)))
-        how = velocity, timeout, drivetrain, yaw_mode, lookahead, adaptive, vehicle
-        return self.on_path([corner], *how)
+        arguments = velocity, timeout, drivetrain, yaw_mode, lookahead, adaptive, vehicle
+        return self.on_path([corner], *arguments)
 
     @rpc("moveOnPath")
     def on_path(
@@ -397,9 +397,9 @@ class Flight:
         ahead = lookahead_of(lookahead, adaptive, velocity)
         ox, oy, oz = vehicle.origin
         corners = [(ox + corner.x_val, oy + corner.y_val, oz + corner.z_val) for corner in path]
-        whole = [vehicle.state().position, *corners]
+        points = [vehicle.state().position, *corners]
         heading = _heading(yaw_mode, drivetrain)
-        task = moves.along_path(whole, velocity, ahead, heading, timeout)
+        task = moves.along_path(points, velocity, ahead, heading, timeout)
         return self.start(vehicle, task if path else Task(task.steer, 0.0))
 
     @rpc("rotateToYaw")

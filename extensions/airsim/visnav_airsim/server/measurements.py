@@ -69,7 +69,7 @@ class Sensors:
         self._orientations: dict[str, Quaternionr] = {}
 
     def announced(self, announcement: ev.Announcement) -> None:
-        """Take note of a vehicle's sensor."""
+        """Store the announcement of a vehicle's sensor."""
         vehicle = self._vehicles.get(announcement.source.partition("/")[0])
         if isinstance(vehicle, ServedMultirotor):
             self._announced[announcement.source] = announcement
@@ -77,8 +77,8 @@ class Sensors:
                 # A turn, and one until the next is there.
                 self._world.remember(2.1 / announcement.rate + announcement.latency)
 
-    def note(self, sample: ev.Event) -> None:
-        """Take note of a sample, and with an IMU's of the true orientation at its stamp."""
+    def add_sample(self, sample: ev.Event) -> None:
+        """Store a sample, and with an IMU's the true orientation at its stamp."""
         if sample.source in self._announced:
             self._newest[sample.source] = sample
             if isinstance(sample, sensors.Imu):
@@ -185,8 +185,12 @@ class Sensors:
         """Return a sensor (the first, if unnamed) and its newest sample, or raise `RpcError`."""
         name = self._names.get(name, name)
         for source, sensor in self._announced.items():
-            carrier, _, own = source.partition("/")
-            if isinstance(sensor, kind) and own and (carrier, name or own) == (vehicle.name, own):
+            carrier, _, sensor_name = source.partition("/")
+            if (
+                isinstance(sensor, kind)
+                and sensor_name
+                and (carrier, name or sensor_name) == (vehicle.name, sensor_name)
+            ):
                 return sensor, self._newest.get(source)
         raise RpcError(f"No {called} with name {name} exist on vehicle")
 
@@ -298,7 +302,7 @@ class Estimates:
         vehicle = self._vehicles.find(estimator.vehicle)
         if not estimator.camera:
             return None
-        return self._cameras.find(vehicle, estimator.camera).told(0).mount
+        return self._cameras.find(vehicle, estimator.camera).announced_eye(0).mount
 
 
 def _checked(pose: Pose) -> tuple[Vector3, Quaternion]:
@@ -439,13 +443,14 @@ class Recording:
             if image.vehicle in {"", name}
         ]
 
-        async def take(taken: Awaitable[msgspec.Raw]) -> msgspec.Raw:
-            return await taken
+        async def wait_for(images: Awaitable[msgspec.Raw]) -> msgspec.Raw:
+            return await images
 
         if requests:
-            taken = take(self._images.take(requests, vehicle, "cosys"))  # whose colours are RGB
+            # The colours of this flavour are RGB.
+            work = wait_for(self._images.capture(requests, vehicle, "cosys"))
             loop = asyncio.get_running_loop()
-            images = await self._node.clock.beside(asyncio.run_coroutine_threadsafe(taken, loop))
+            images = await self._node.clock.beside(asyncio.run_coroutine_threadsafe(work, loop))
             await self._node.offload(_write, folder, name, pose, images)
 
 

@@ -151,7 +151,7 @@ class Table:
     ) -> None:
         self._log, self._finders = log, finders or {}
         self._called: set[str] = set()
-        self.methods = constant_methods(self._note)
+        self.methods = constant_methods(self._record_ignored)
         for group in groups:
             methods = methods_of(group)
             assert not methods.keys() & self.methods.keys(), methods.keys() & self.methods.keys()
@@ -197,7 +197,7 @@ class Table:
         except EXPECTED_ERRORS as error:
             raise RpcError(thrown(name, count, str(error))) from None
 
-    def _note(self, method: str) -> None:
+    def _record_ignored(self, method: str) -> None:
         if method not in self._called:
             self._called.add(method)
             self._log.warning("%s has no effect here", method)
@@ -219,8 +219,8 @@ def thrown(name: str, count: int, text: str) -> str:
     )
 
 
-def constant_methods(note: Callable[[str], None] = lambda _: None) -> dict[str, Method]:
-    """Return the methods with constant answers; `note` is told of calls without effect."""
+def constant_methods(record: Callable[[str], None] = lambda _: None) -> dict[str, Method]:
+    """Return the methods with constant answers; `record` is called for those without effect."""
     content = "with which the clients of AirSim and of Cosys-AirSim are content."
     rows: list[tuple[str, Callable[..., Any], str, str]] = [
         ("ping", lambda: True, "Answer ``True``.", ""),
@@ -231,7 +231,7 @@ def constant_methods(note: Callable[[str], None] = lambda _: None) -> dict[str, 
         result = False if description.startswith("Return") else None
 
         def accept(*_: Any, name: str = name, result: bool | None = result) -> bool | None:
-            note(name)
+            record(name)
             return result
 
         rows.append((name, accept, description, arguments))

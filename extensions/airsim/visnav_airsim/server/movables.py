@@ -80,16 +80,16 @@ def add_movables(
     if not specs and not movable:
         return
     world = scene.spec.copy().compile()
-    # What MuJoCo takes from the mean of all bodies is to be as without these.
+    # MuJoCo's means over all bodies stay as without these.
     for name in ("meanmass", "meansize", "extent", "center"):
         setattr(scene.spec.stat, name, getattr(world.stat, name))
-    held = []
+    names = []
     for number, (name, spec) in enumerate(spare_objects(node, specs).items()):
         _add_spare(scene, name, spec, (0.0, 0.0, AWAY + 100.0 * number))
-        held.append(name)
+        names.append(name)
     for expression in movable:
-        held += _free(scene.spec, world, expression)
-    for geom in (geom for name in held for geom in scene.spec.body(name).geoms):
+        names += _free(scene.spec, world, expression)
+    for geom in (geom for name in names for geom in scene.spec.body(name).geoms):
         if geom.contype or geom.conaffinity:
             geom.contype, geom.conaffinity = MOVABLE, 0
 
@@ -101,8 +101,8 @@ def movable_bodies(model: Any) -> dict[str, int]:
     return {name: body for name, body in named.items() if not name.endswith("/base_link")}
 
 
-def have_met(model: Any) -> None:
-    """Let vehicles and all other moving bodies collide with held bodies."""
+def enable_collisions(model: Any) -> None:
+    """Make vehicles and all other moving bodies collide with held bodies."""
     free = (model.body_weldid[model.geom_bodyid] != 0) & (model.geom_contype == WORLD)
     model.geom_conaffinity[free] |= MOVABLE
     for body in np.unique(model.geom_bodyid[free]):
@@ -110,15 +110,15 @@ def have_met(model: Any) -> None:
 
 
 def set_free(model: Any, body: int, free: bool) -> None:
-    """Let physics move a body (`free`), or make the body holdable; after `have_met`."""
+    """Let physics move a body (`free`), or make the body holdable; after `enable_collisions`."""
     dofs = slice(model.body_dofadr[body], model.body_dofadr[body] + 6)
     geoms = (model.geom_bodyid == body) & (model.geom_contype != 0)
     model.body_gravcomp[body] = 0.0 if free else 1.0
     model.dof_armature[dofs] = 0.0 if free else HELD
-    for of, chosen in (("geom", geoms), ("body", body)):
-        getattr(model, f"{of}_contype")[chosen] = WORLD if free else MOVABLE
-        getattr(model, f"{of}_conaffinity")[chosen] = WORLD | MOVABLE if free else 0
-    # What MuJoCo computes of these when it compiles a model.
+    for element, chosen in (("geom", geoms), ("body", body)):
+        getattr(model, f"{element}_contype")[chosen] = WORLD if free else MOVABLE
+        getattr(model, f"{element}_conaffinity")[chosen] = WORLD | MOVABLE if free else 0
+    # Values that MuJoCo computes when it compiles a model.
     model.dof_M0[dofs] = [*[model.body_mass[body]] * 3, *model.body_inertia[body]]
     model.dof_M0[dofs] += model.dof_armature[dofs]
     straight, turn = (1.0 / model.dof_M0[dofs]).reshape(2, 3).mean(axis=1)
@@ -127,7 +127,7 @@ def set_free(model: Any, body: int, free: bool) -> None:
 
 
 class Holder:
-    """Holds bodies where they are put: an influence on a simulation."""
+    """Influence on a simulation that holds bodies at given poses."""
 
     @classmethod
     def of(cls, simulation: Simulation) -> Holder:
@@ -141,7 +141,7 @@ class Holder:
     def __init__(self) -> None:
         self._poses: dict[int, Any] = {}
         self._positions = self._velocities = np.empty(0, np.intp)
-        self._held = np.empty(0)
+        self._held_poses = np.empty(0)
 
     def hold(self, model: Any, body: int, pose: Any) -> None:
         """Hold a body at its free joint's pose, shape (7,); `None` releases the body."""
@@ -153,18 +153,18 @@ class Holder:
         poses = model.jnt_qposadr[model.body_jntadr[bodies]]
         self._positions = np.add.outer(poses, np.arange(7)).ravel()
         self._velocities = np.add.outer(dofs, np.arange(6)).ravel()
-        self._held = np.concatenate([*self._poses.values(), np.empty(0)])
+        self._held_poses = np.concatenate([*self._poses.values(), np.empty(0)])
 
     def apply(self, model: Any, data: Any, seconds: float) -> None:  # noqa: ARG002
-        """Put all bodies back."""
-        data.qpos[self._positions] = self._held
+        """Set all bodies to their poses."""
+        data.qpos[self._positions] = self._held_poses
         data.qvel[self._velocities] = 0.0
 
 
 def _add_spare(
     scene: Scene, name: str, spec: SpareObject, place: tuple[float, float, float]
 ) -> None:
-    body = _held(scene.spec, name, pos=place)
+    body = _add_held_body(scene.spec, name, pos=place)
     if spec.asset in COLOURS:
         kind: Any = spec.asset
         length, width, height = (a * b for a, b in zip(SIZES[kind], spec.scale, strict=True))
@@ -174,8 +174,8 @@ def _add_spare(
     options: dict[str, Any] = {"size": [x, z, 0.0] if spec.asset == "Cylinder" else [x, y, z]}
     if spec.asset == "Cone":
         turns = np.arange(24) * math.pi / 12
-        ring = [(x * math.cos(turn), y * math.sin(turn), -z) for turn in turns]
-        scene.spec.add_mesh(name=name, uservert=np.ravel([(0.0, 0.0, z), *ring]))
+        vertices = [(x * math.cos(turn), y * math.sin(turn), -z) for turn in turns]
+        scene.spec.add_mesh(name=name, uservert=np.ravel([(0.0, 0.0, z), *vertices]))
         options = {"meshname": name}
     rgba = [*(spec.colour or (0.6, 0.6, 0.6)), 1.0]
     body.add_geom(type=_TYPES[spec.asset], rgba=rgba, group=0, **options)
@@ -184,14 +184,14 @@ def _add_spare(
 def _free(spec: Any, world: Any, expression: str) -> list[str]:
     geoms = {geom.name: geom for geom in spec.worldbody.geoms if geom.name}
     bodies = {body.name: body for body in spec.worldbody.bodies if body.name}
-    still = {name: body for name, body in bodies.items() if not body.joints and not body.mocap}
+    fixed = {name: body for name, body in bodies.items() if not body.joints and not body.mocap}
     matches = whole_matches(expression, [name for name in geoms if not name.endswith(LOOK)])
     for name in matches:
         parts = [geoms[key] for key in (name, name + LOOK) if key in geoms]
         if any(part.type == mujoco.mjtGeom.mjGEOM_PLANE for part in parts):
             raise ValueError(f"movable: expected what can be moved, found {name}, a plane")
         pose = _pose(world, name)
-        body = _held(spec, name, **_options(pose))
+        body = _add_held_body(spec, name, **_options(pose))
         body.explicitinertial, body.mass, body.inertia = True, 100.0, [10.0, 10.0, 10.0]
         for part in parts:
             options = {key: getattr(part, key) for key in _COPIED}
@@ -200,10 +200,10 @@ def _free(spec: Any, world: Any, expression: str) -> list[str]:
                 options["size"] = world.geom(part.name).size  # of a capsule between two points
             spec.delete(part)
             body.add_geom(**options)
-    names = whole_matches(expression, still)
+    names = whole_matches(expression, fixed)
     for name in names:
-        still[name].add_joint(type=mujoco.mjtJoint.mjJNT_FREE, armature=HELD)
-        still[name].gravcomp = 1.0
+        fixed[name].add_joint(type=mujoco.mjtJoint.mjJNT_FREE, armature=HELD)
+        fixed[name].gravcomp = 1.0
     if not matches and not names:
         raise ValueError(
             f"movable: expected names of geoms or of bodies without joints, found {expression}"
@@ -233,7 +233,7 @@ def _options(pose: Any) -> dict[str, Any]:
     return {"pos": pose[:3, 3], "quat": turn}
 
 
-def _held(spec: Any, name: str, **options: Any) -> Any:
+def _add_held_body(spec: Any, name: str, **options: Any) -> Any:
     body = spec.worldbody.add_body(name=name, gravcomp=1.0, **options)
     body.add_joint(type=mujoco.mjtJoint.mjJNT_FREE, armature=HELD)
     return body

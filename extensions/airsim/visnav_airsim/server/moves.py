@@ -66,9 +66,9 @@ class Tasks:
         clock: Clock,
         source: str,
         send: Callable[[ev.Command | ev.Setpoint], None],
-        owed: Callable[[Reply], Reply],  # gives the reply for a task's; see `Time.owed`
+        reply_for: Callable[[Reply], Reply],  # returns a task's reply; see `Time.reply_for`
     ) -> None:
-        self._clock, self._source, self._send, self._owed = clock, source, send, owed
+        self._clock, self._source, self._send, self._reply_for = clock, source, send, reply_for
         self._slots: dict[str, _Slot] = {}
 
     def order(self, vehicle: ServedVehicle, order: Order) -> None:
@@ -82,21 +82,21 @@ class Tasks:
         slot.result = result = asyncio.get_running_loop().create_future()
         if not task.limit > 0.0:
             slot.finish(task.at_limit)
-            return self._owed(result)
+            return self._reply_for(result)
         slot.task, slot.started = task, self._clock.now()
         if not vehicle.motors_on:
             vehicle.motors_on = True
             self._order(slot, ev.Arm)
         elif slot.is_landing:  # until it hovers, it would refuse set-points
             self._order(slot, ev.Hover)
-        return self._owed(result)
+        return self._reply_for(result)
 
     def cancel(self, vehicle: ServedVehicle) -> None:
         """End the task of a vehicle, if any, with result `False`."""
         if slot := self._slots.get(vehicle.name):
             slot.finish(False)
 
-    def note(self, vehicle: ServedMultirotor, event: ev.VehicleEvent) -> None:
+    def handle_event(self, vehicle: ServedMultirotor, event: ev.VehicleEvent) -> None:
         """Update the state of a vehicle's motors from an event."""
         if isinstance(event, ev.Armed):
             vehicle.motors_on = True
@@ -108,7 +108,7 @@ class Tasks:
                 slot.ordered = None
 
     def update(self, stamp: int) -> None:
-        """Let all tasks steer."""
+        """Send the next set-points of all tasks."""
         for slot in self._slots.values():
             if not slot.vehicle.motors_on:
                 slot.finish(slot.is_landing)
@@ -196,7 +196,7 @@ class PathFollower:
         self.is_last = False  # whether the lookahead point is at the end of the path
 
     def advance(self, position: Vector3) -> Vector3:
-        """Take a vehicle's position (m), and return where the lookahead point is."""
+        """Advance by a vehicle's position (m), and return the lookahead point."""
         self._advance_progress(position)
         ahead = min(self.progress + self._lookahead, self.length)
         # Round a sharp corner, it may be where the vehicle is already: then it runs on, up to 5 m.
@@ -240,7 +240,7 @@ class PathFollower:
 
 
 class Heading:
-    """Where to look on the way.
+    """Direction of the view during a move.
 
     Args:
         follows: Look where the vehicle goes (AirSim's ``ForwardOnly``) plus the angle, unless a

@@ -154,7 +154,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         estimators = config.estimators
         self.script_estimates = Estimates(estimators, vehicles, cameras, now, self._send)
         self.time = Time(config.time, self.clock, self.stepping, frame_rate)
-        self.tasks = Tasks(self.clock, self.name, self._send, self.time.owed)
+        self.tasks = Tasks(self.clock, self.name, self._send, self.time.reply_for)
         resets = objects.reset, scenery.reset
         self.table = Table(
             [
@@ -223,7 +223,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         self._attended(True)
 
     def _attended(self, is_anybody: bool) -> None:
-        """Take note of whether any client is there, without whom time might stand for ever."""
+        """Handle whether any client is connected, as without one time might stand for ever."""
         self.doing = ""
         if self._waiting is not None:
             self._waiting.cancel()
@@ -250,15 +250,15 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
 
     @on(VehicleEvent)
     def vehicle_events(self, event: VehicleEvent) -> None:
-        """Note the start and stop of motors, and collisions."""
+        """Record the start and stop of motors, and collisions."""
         vehicle = self.vehicles.get(event.source)
         if isinstance(vehicle, ServedMultirotor):
-            self.tasks.note(vehicle, event)
-            self.collisions.note(vehicle, event)
+            self.tasks.handle_event(vehicle, event)
+            self.collisions.handle_event(vehicle, event)
 
     @every(hz=RATE)
     def fly(self, tick: Tick) -> None:
-        """Let the vehicles' tasks steer, and check the vehicles' contacts."""
+        """Send the set-points of the vehicles' tasks, and check the vehicles' contacts."""
         self.tasks.update(tick.stamp)
         self.collisions.watch()
 
@@ -275,7 +275,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
         return True
 
     def on_announcement(self, announcement: Announcement) -> None:
-        """Take note of the vehicles' sensors."""
+        """Store the announcements of the vehicles' sensors."""
         self.sensors.announced(announcement)
         if isinstance(announcement, CameraAnnouncement):
             self.cameras.announced(announcement)
@@ -283,8 +283,8 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
 
     @on(*SAMPLES)
     def samples(self, event: Any) -> None:
-        """Take note of the vehicles' samples."""
-        self.sensors.note(event)
+        """Store the samples of the vehicles' sensors."""
+        self.sensors.add_sample(event)
 
     def _send(self, event: Command | Setpoint | PoseEstimate) -> None:
         if isinstance(event, Setpoint):
@@ -298,7 +298,7 @@ class AirsimServer(Inhabitant, Node[AirsimServerConfig]):
 class Time:
     """Pausing and stepping; `frame_rate` is that of the fastest camera, Hz.
 
-    With ``time = "awaited"`` time runs while a vehicle's task goes on (see `owed`) and no client
+    With ``time = "awaited"`` time runs during a vehicle's task (see `reply_for`), unless a client
     has paused it.
     """
 
@@ -306,7 +306,7 @@ class Time:
         self._clock, self._stepping = clock, stepping
         self._period = SECOND / Fraction(frame_rate).limit_denominator()
         self._awaited, self._paused = mode == "awaited", mode == "paused"
-        self._owed = 0
+        self._running_tasks = 0
 
     async def begin(self) -> None:
         """Pause time, unless set to run, until time stands; `CommandError` if out of control."""
@@ -314,7 +314,7 @@ class Time:
             self._stepping.pause()
             await self._stepping.stands()
 
-    def owed(self, task: asyncio.Future[R]) -> asyncio.Future[R]:
+    def reply_for(self, task: asyncio.Future[R]) -> asyncio.Future[R]:
         """Return a future for the reply to a vehicle's task; cancelling it leaves the task.
 
         With ``time = "awaited"`` time runs until the task is done, and the reply comes once time
@@ -324,11 +324,11 @@ class Time:
         if not self._awaited:
             return task
         reply: asyncio.Future[R] = task.get_loop().create_future()
-        self._owed += 1
+        self._running_tasks += 1
         self._apply()
 
         def ended(_: asyncio.Future[R]) -> None:
-            self._owed -= 1
+            self._running_tasks -= 1
             self._apply()
             self._stepping.stands().add_done_callback(lambda _: _copy(task, reply))
 
@@ -371,7 +371,7 @@ class Time:
             over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
             due = self._clock.now() + ns
             self._clock.schedule.add(due, Once(lambda: over.set_result(None)))
-            return self.owed(over)
+            return self.reply_for(over)
         if ns > 0:
             step = self._stepping.step(ns)
         else:
@@ -388,7 +388,7 @@ class Time:
         """Run time while a task's reply is owed, else pause; leave a client's pause."""
         if not self._awaited or self._paused:
             return
-        if self._owed == 0:
+        if self._running_tasks == 0:
             self._stepping.pause()
         elif self._stepping.state != "running":
             self._stepping.resume()

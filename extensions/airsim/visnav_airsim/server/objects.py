@@ -58,7 +58,7 @@ class Objects:
         log: NodeLogger,
     ) -> None:
         self._world, self._now, self._log = world, now, log
-        self._still: Any = None
+        self._initial_data: Any = None
         self._warned: set[str] = set()
         model = world.model
         self._spares = {model.body(name).id: spec for name, spec in spares.items()}
@@ -76,10 +76,10 @@ class Objects:
         }
         self._at_start = dict(self._bodies), dict(self.geoms), model.qpos0.copy()
         if self._held and world.simulation is not None:
-            movables.have_met(model)
+            movables.enable_collisions(model)
             self._holder = movables.Holder.of(world.simulation)
         for body in self._held:
-            self._put(body, self._home(body))
+            self._place_body(body, self._home(body))
         self._ids = np.full(model.ngeom + 1, HIDDEN)
         for name in sorted(self.geoms, key=lambda object_name: -len(self.geoms[object_name])):
             self._number(name, initial_id(name))  # that of a part goes before that of the whole
@@ -89,7 +89,7 @@ class Objects:
         self._bodies = dict(self._at_start[0])
         self.geoms = dict(self._at_start[1])
         for body in {*self._bodies.values(), *self._held}:
-            self._put(body, self._home(body))
+            self._place_body(body, self._home(body))
 
     def data(self) -> Any:
         """Return MuJoCo's data of the world at the present time, with positions computed."""
@@ -98,12 +98,12 @@ class Objects:
             simulation.advance_to(now)
             simulation.refresh()
             return simulation.data
-        if self._still is None:
-            self._still = mujoco.MjData(self._world.model)
-        _, self._still.qpos[:], _ = self._world.state_at(now)
-        self._world.dynamics.apply(self._world.model, self._still, now * 1e-9)
-        mujoco.mj_kinematics(self._world.model, self._still)
-        return self._still
+        if self._initial_data is None:
+            self._initial_data = mujoco.MjData(self._world.model)
+        _, self._initial_data.qpos[:], _ = self._world.state_at(now)
+        self._world.dynamics.apply(self._world.model, self._initial_data, now * 1e-9)
+        mujoco.mj_kinematics(self._world.model, self._initial_data)
+        return self._initial_data
 
     def identify(self, touched: str) -> tuple[str, int]:
         """Return name and segmentation ID of the object of a geom or body in the model."""
@@ -121,8 +121,8 @@ class Objects:
     @rpc("simGetSegmentationObjectID")
     def segmentation_id(self, name: str) -> int:
         """Return the ID of an object, whatever the case of its name; -1 if there is none."""
-        known = {key.lower(): geoms for key, geoms in self.geoms.items()}
-        geoms = known.get(name.lower())
+        by_name = {key.lower(): geoms for key, geoms in self.geoms.items()}
+        geoms = by_name.get(name.lower())
         return int(self._ids[geoms[0]]) if geoms else HIDDEN
 
     @rpc("simSetSegmentationObjectID")
@@ -165,7 +165,7 @@ class Objects:
         if name not in self._bodies:
             self._warn("simSetObjectPose", f"{name!r:.80} is not in `movable` of the settings")
             return False
-        self._put(self._bodies[name], qpos, keep=True)
+        self._place_body(self._bodies[name], qpos, keep=True)
         return True
 
     @rpc("simListAssets")
@@ -193,10 +193,10 @@ class Objects:
         free = [body for body, spare in self._spares.items() if spare.asset == asset]
         if not (free := [body for body in free if body not in used]):
             raise RpcError(f"all objects {asset} are in the world: the settings can have more")
-        wanted = astuple(scale)
-        body = next((body for body in free if self._spares[body].scale == wanted), free[0])
-        if (fixed := self._spares[body].scale) != wanted:
-            self._warn("simSpawnObject", f"the scale is {fixed} of the settings, not {wanted}")
+        factors = astuple(scale)
+        body = next((body for body in free if self._spares[body].scale == factors), free[0])
+        if (fixed := self._spares[body].scale) != factors:
+            self._warn("simSpawnObject", f"the scale is {fixed} of the settings, not {factors}")
         name = name or asset
         if name in self.geoms:
             numbered = (f"{name}{number}" for number in itertools.count(1))
@@ -205,7 +205,7 @@ class Objects:
         geoms = tuple(np.flatnonzero(self._world.model.geom_bodyid == body).tolist())
         self.geoms = dict(sorted({**self.geoms, name: geoms}.items()))
         self._number(name, initial_id(name))
-        self._put(body, qpos, free=physics)
+        self._place_body(body, qpos, free=physics)
         return name
 
     @rpc("simDestroyObject")
@@ -214,10 +214,10 @@ class Objects:
         if (body := self._bodies.get(name, -1)) not in self._held:
             return False
         del self._bodies[name], self.geoms[name]
-        away = self._home(body)
+        home = self._home(body)
         if body not in self._spares:
-            away[2] += movables.AWAY + 100.0 * (len(self._spares) + body)
-        self._put(body, away)
+            home[2] += movables.AWAY + 100.0 * (len(self._spares) + body)
+        self._place_body(body, home)
         return True
 
     @rpc("simGetObjectScale")
@@ -242,16 +242,16 @@ class Objects:
             self._log.warning("%s: %s", method, text)
 
     def _home(self, body: int) -> Any:
-        begin = self._world.model.jnt_qposadr[self._world.model.body_jntadr[body]]
-        return self._at_start[2][begin : begin + 7].copy()
+        start = self._world.model.jnt_qposadr[self._world.model.body_jntadr[body]]
+        return self._at_start[2][start : start + 7].copy()
 
-    def _put(self, body: int, qpos: Any, *, free: bool = False, keep: bool = False) -> None:
+    def _place_body(self, body: int, qpos: Any, *, free: bool = False, keep: bool = False) -> None:
         """Put a body at rest into a pose: held, free, or as before (`keep`)."""
         model, simulation = self._world.model, self._world.simulation
-        begin = int(model.jnt_qposadr[model.body_jntadr[body]])
+        first = int(model.jnt_qposadr[model.body_jntadr[body]])
         dof = int(model.body_dofadr[body])
         if simulation is None:
-            model.qpos0[begin : begin + 7] = qpos
+            model.qpos0[first : first + 7] = qpos
             return
         simulation.advance_to(self._now())
         if body in self._held:
@@ -259,7 +259,7 @@ class Objects:
                 free = model.dof_armature[dof] == 0.0
             movables.set_free(model, body, free)
             self._holder.hold(model, body, None if free else qpos)
-        simulation.data.qpos[begin : begin + 7] = qpos
+        simulation.data.qpos[first : first + 7] = qpos
         simulation.data.qvel[dof : dof + 6] = 0.0
         simulation.changed()
 
@@ -315,8 +315,8 @@ class Scenery:
     def extents(self) -> list[GeoPoint]:
         """Return the lowest south-west corner of all finite objects, and the opposite."""
         model, data = self._world.model, self._objects.data()
-        shown = {geom for geoms in self._objects.geoms.values() for geom in geoms}
-        bounded = [geom for geom in sorted(shown) if model.geom_rbound[geom] > 0.0]
+        geoms_shown = {geom for geoms in self._objects.geoms.values() for geom in geoms}
+        bounded = [geom for geom in sorted(geoms_shown) if model.geom_rbound[geom] > 0.0]
         boxes = model.geom_aabb[bounded]
         axes = data.geom_xmat[bounded].reshape(-1, 3, 3)
         middle = data.geom_xpos[bounded] + np.einsum("nij,nj->ni", axes, boxes[:, :3])
@@ -344,11 +344,11 @@ class Scenery:
         """Return whether nothing but a vehicle is on a straight line, metres in ``map``."""
         model, data = self._world.model, self._objects.data()
         body = mujoco.mj_name2id(model, _BODY, f"{vehicle}/base_link")
-        begin, way = np.array(flip_yz(start)), np.subtract(flip_yz(end), flip_yz(start))
-        length = float(np.linalg.norm(way))
+        origin, direction = np.array(flip_yz(start)), np.subtract(flip_yz(end), flip_yz(start))
+        length = float(np.linalg.norm(direction))
         if not 1e-9 < length < math.inf:
             return length <= 1e-9
-        distance, _ = cast_ray(model, data, begin, way / length, None, body)
+        distance, _ = cast_ray(model, data, origin, direction / length, None, body)
         return distance < 0.0 or distance >= length
 
     def _in_map(self, point: GeoPoint) -> Vector3:

@@ -94,7 +94,7 @@ _SHADES = {
 """Colour of each segmentation ID, RGB, shape (256, 3), by type of image."""
 
 
-def packed(kind: ImageType, seen: Seen, form: Form) -> npt.NDArray[np.uint8]:
+def packed(kind: ImageType, view: Seen, form: Form) -> npt.NDArray[np.uint8]:
     """Return an image encoded for sending.
 
     Args:
@@ -102,8 +102,8 @@ def packed(kind: ImageType, seen: Seen, form: Form) -> npt.NDArray[np.uint8]:
             from the top; ``png``: a PNG with red, green, blue and an alpha of 255.
     """
     if form == "float":
-        return np.frombuffer(wire.float_array(as_numbers(kind, seen)), np.uint8)
-    colours = as_colours(kind, seen)
+        return np.frombuffer(wire.float_array(as_numbers(kind, view)), np.uint8)
+    colours = as_colours(kind, view)
     if form == "png":
         opaque = cv2.cvtColor(colours, cv2.COLOR_RGB2BGRA)  # OpenCV's own order
         png = cv2.imencode(".png", opaque, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
@@ -113,11 +113,11 @@ def packed(kind: ImageType, seen: Seen, form: Form) -> npt.NDArray[np.uint8]:
     return colours.ravel()
 
 
-def as_numbers(kind: ImageType, seen: Seen) -> Depths:
+def as_numbers(kind: ImageType, view: Seen) -> Depths:
     """Return an image as numbers, shape (h, w)."""
-    depth, info = seen.drawn.depth, seen.info
+    depth, info = view.drawn.depth, view.info
     if kind not in OF_DEPTH or kind is ImageType.SURFACE_NORMALS or depth is None:
-        return np.asarray(as_colours(kind, seen)[..., 0] / 255.0, np.float32)
+        return np.asarray(as_colours(kind, view)[..., 0] / 255.0, np.float32)
     if kind is ImageType.DEPTH_PERSPECTIVE:
         columns, rows = _slopes(info)
         depth = depth * np.sqrt(1.0 + columns**2 + rows**2)
@@ -129,21 +129,21 @@ def as_numbers(kind: ImageType, seen: Seen) -> Depths:
     return np.asarray(depth, np.float32)
 
 
-def as_colours(kind: ImageType, seen: Seen) -> Colours:
+def as_colours(kind: ImageType, view: Seen) -> Colours:
     """Return an image as colours, RGB, shape (h, w, 3)."""
-    colours, depth, numbers = seen.drawn
+    colours, depth, numbers = view.drawn
     if kind is ImageType.SCENE and colours is not None:
         return colours
     if kind in OF_NUMBERS and numbers is not None:
-        shades = np.pad(_SHADES[kind][seen.ids], ((0, 0), (0, 1)))  # a word each: that is quicker
-        shown = np.take(shades.view(np.uint32), numbers, mode="wrap")  # that of nothing is -1
-        pixels = shown.view(np.uint8).reshape(*shown.shape, 4)
+        shades = np.pad(_SHADES[kind][view.ids], ((0, 0), (0, 1)))  # a word each: that is quicker
+        words = np.take(shades.view(np.uint32), numbers, mode="wrap")  # that of nothing is -1
+        pixels = words.view(np.uint8).reshape(*words.shape, 4)
         return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGBA2RGB), np.uint8)
     if kind is ImageType.SURFACE_NORMALS and depth is not None:
-        turned = surface_normals(depth, seen.info) @ seen.turn.T.astype(np.float32)
+        turned = surface_normals(depth, view.info) @ view.turn.T.astype(np.float32)
         levels = np.rint((turned + np.float32(1.0)) * np.float32(127.5))
         return np.where(np.isfinite(depth)[..., None], levels, 0.0).astype(np.uint8)
-    grey = np.rint(np.minimum(as_numbers(kind, seen), 1.0) * 255.0).astype(np.uint8)
+    grey = np.rint(np.minimum(as_numbers(kind, view), 1.0) * 255.0).astype(np.uint8)
     return np.repeat(grey[..., None], 3, axis=-1)
 
 
@@ -222,7 +222,7 @@ class Renderer:
         self._camera = int(self._model.camera(camera).id)
         self._make = partial(open_stage, renderer, self._model, infos, threads, dynamics, drawable)
 
-    def take(
+    def render(
         self, stamp: int, qpos: Floats, ids: npt.NDArray[np.uint8], wanted: Sequence[Wanted]
     ) -> list[npt.NDArray[np.uint8]]:
         """Return images of a single state, encoded for sending; each view is drawn once.
@@ -239,8 +239,8 @@ class Renderer:
         for number, request in enumerate(wanted):
             places.setdefault(request.eye, []).append(number)
         for eye, numbers in places.items():
-            seen = self._see(eye, stamp, qpos, ids, {wanted[n].kind for n in numbers})
-            images |= {n: packed(wanted[n].kind, seen, wanted[n].form) for n in numbers}
+            view = self._see(eye, stamp, qpos, ids, {wanted[n].kind for n in numbers})
+            images |= {n: packed(wanted[n].kind, view, wanted[n].form) for n in numbers}
         return [images[n] for n in range(len(wanted))]
 
     def answer(
@@ -256,7 +256,7 @@ class Renderer:
         All work on pixels is done here: it would hold up the run's loop.
         """
         replies = msgspec.msgpack.decode(responses)
-        images = self.take(stamp, qpos, ids, wanted)
+        images = self.render(stamp, qpos, ids, wanted)
         for response, request, image in zip(replies, wanted, images, strict=True):
             if request.form == "float":
                 response["image_data_float"] = msgspec.Raw(image.data)
@@ -265,7 +265,7 @@ class Renderer:
         return np.frombuffer(msgspec.msgpack.encode(replies), np.uint8)
 
     def close(self) -> None:
-        """Give back what the renderer holds."""
+        """Release the renderer's resources."""
         if "_stage" in self.__dict__:
             self._stage.close()
 

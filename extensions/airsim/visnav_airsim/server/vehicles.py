@@ -35,7 +35,7 @@ FIRST: Any = ""  # default vehicle in handlers' parameters: the vehicle for an e
 GAS_CONSTANT = 287.053  # of dry air, J/(kg K)
 LANDED_SPEED = 0.08  # as AirSim's: m/s and rad/s, of each component of the velocity of what stands
 APART = 10  # looks, of 20 ms each, without contact after which the next contact is a new one
-# What a vehicle that was just put somewhere touches for `APART` looks.
+# Contacts of a vehicle that was just placed: with anything, for `APART` looks.
 _ANYTHING: dict[str, int] = {"": 0}
 
 
@@ -188,7 +188,7 @@ class Vehicles(dict[str, ServedVehicle]):
         self._cameras: dict[str, CameraAnnouncement] = {}
 
     def announced(self, camera: CameraAnnouncement) -> None:
-        """Take note of the announced calibration of a vehicle's camera."""
+        """Store the announced calibration of a vehicle's camera."""
         self._cameras[camera.source] = camera
 
     def find(self, name: str) -> ServedVehicle:
@@ -234,9 +234,9 @@ class Vehicles(dict[str, ServedVehicle]):
             stamp = self._world.simulation.time_ns
             qpos = self._world.simulation.data.qpos.copy()
         for name, state_at in self._world.free_cameras.items():
-            begin = int(self._world.model.joint(name).qposadr[0])
+            start = int(self._world.model.joint(name).qposadr[0])
             state = state_at(stamp)
-            qpos[begin : begin + 7] = pose_to_qpos(state.position, state.orientation)
+            qpos[start : start + 7] = pose_to_qpos(state.position, state.orientation)
         return stamp, qpos
 
     @rpc("listVehicles")
@@ -247,15 +247,15 @@ class Vehicles(dict[str, ServedVehicle]):
     @rpc("getSettingsString")
     def settings(self) -> Awaitable[str] | str:
         """Return the settings.json of the settings, else a description of the run."""
-        given = self._settings
-        if not given:
+        settings = self._settings
+        if not settings:
             return json.dumps(self._described())
-        if given.lstrip().startswith("{"):
-            return given
+        if settings.lstrip().startswith("{"):
+            return settings
 
         async def read() -> str:
             try:
-                return await self._node.offload(Path(given).read_text, "utf-8")
+                return await self._node.offload(Path(settings).read_text, "utf-8")
             except (OSError, UnicodeDecodeError) as error:
                 raise RpcError(f"settings: expected a readable file, found: {error}") from None
 
@@ -364,10 +364,12 @@ class Collisions:
         vehicle.collision = wire.CollisionInfo()
         self._touched[vehicle.name] = _ANYTHING
 
-    def note(self, vehicle: ServedMultirotor, event: VehicleEvent) -> None:
+    def handle_event(self, vehicle: ServedMultirotor, event: VehicleEvent) -> None:
         """Record a collision from an event of the vehicle's node."""
         if isinstance(event, Collision):
-            self._take(vehicle, [c for c in vehicle.physics.contacts() if c.other == event.other])
+            self._handle_contacts(
+                vehicle, [c for c in vehicle.physics.contacts() if c.other == event.other]
+            )
 
     def watch(self) -> None:
         """Check the vehicles' contacts; to be called 50 times a second."""
@@ -381,9 +383,9 @@ class Collisions:
             self._touched[vehicle.name] = aged | {contact.other: 0 for contact in contacts}
             new = [contact for contact in contacts if contact.other not in before]
             if new and "" not in before:
-                self._take(vehicle, new)
+                self._handle_contacts(vehicle, new)
 
-    def _take(self, vehicle: ServedMultirotor, contacts: list[Contact]) -> None:
+    def _handle_contacts(self, vehicle: ServedMultirotor, contacts: list[Contact]) -> None:
         contact = max(contacts, key=lambda c: c.depth)
         vehicle.collision = wire.CollisionInfo(
             True,
