@@ -143,8 +143,8 @@ class EvalioProcess:
         defaults = pipeline.default_params()
         fixed = {name: value for name, value in _FIXED.items() if name in defaults}
         usual = {name: value for name, value in _USUAL.items() if name in defaults}
-        given = _checked(config, defaults)
-        pipeline.set_params(defaults | usual | given | fixed)
+        parameters = _checked(config, defaults)
+        pipeline.set_params(defaults | usual | parameters | fixed)
         pipeline.initialize()
         return pipeline
 
@@ -156,7 +156,7 @@ class EvalioProcess:
         rings: npt.NDArray[np.uint16],  # channels of the rays, shape (n,)
         samples: Floats,
     ) -> TrackingResult:
-        """Take in samples and the next scan; return the pose of the lidar.
+        """Process samples and the next scan; return the pose of the lidar.
 
         It is that of this scan, or of one `_SCANS_LATE` before, in the lidar's frame at the first.
 
@@ -166,8 +166,8 @@ class EvalioProcess:
                 velocity, specific force; shape (m, 7).
         """
         types, pipeline = self._types, self._pipeline
-        for time, *rest in samples.tolist():
-            gyro, force = (np.array(vector) * (1, -1, -1) for vector in (rest[:3], rest[3:]))
+        for time, *sample in samples.tolist():
+            gyro, force = (np.array(vector) * (1, -1, -1) for vector in (sample[:3], sample[3:]))
             pipeline.add_imu(types.ImuMeasurement(types.Stamp.from_nsec(int(time)), gyro, force))
         near, far = self._limits
         distances = np.linalg.norm(points, axis=1)
@@ -209,9 +209,9 @@ class EvalioProcess:
         grid = np.zeros((rows, columns, 3))
         grid[rings[usable], column[usable]] = points[usable] * (1, -1, -1)
         ranges = (1000.0 * np.linalg.norm(grid, axis=2)).astype(int).tolist()
-        waits = [duration.from_sec(k * step) for k in range(columns)]
+        offsets = [duration.from_sec(k * step) for k in range(columns)]
         cloud = [
-            make(x=x, y=y, z=z, t=waits[col], range=ranges[row][col], row=row, col=col)
+            make(x=x, y=y, z=z, t=offsets[col], range=ranges[row][col], row=row, col=col)
             for row, line in enumerate(grid.tolist())
             for col, (x, y, z) in enumerate(line)
         ]
@@ -226,19 +226,19 @@ def _checked(config: EvalioConfig, defaults: dict[str, Any]) -> dict[str, Any]:
     Raises:
         ValueError: The pipeline has no such parameter, or one of another type.
     """
-    known = {name: value for name, value in defaults.items() if name not in _FIXED}
-    given = {}
+    allowed = {name: value for name, value in defaults.items() if name not in _FIXED}
+    checked = {}
     for name, value in config.parameters.items():
-        if name not in known:
+        if name not in allowed:
             raise ValueError(
-                f"parameters.{name}: expected one of {config.pipeline}'s: {', '.join(known)}"
-                + suggest(name, known)
+                f"parameters.{name}: expected one of {config.pipeline}'s: {', '.join(allowed)}"
+                + suggest(name, allowed)
             )
-        kind = type(known[name])
+        kind = type(allowed[name])
         if type(value) is not kind and (kind, type(value)) != (float, int):
             raise ValueError(f"parameters.{name}: expected {kind.__name__}, found {value!r}")
-        given[name] = kind(value)
-    return given
+        checked[name] = kind(value)
+    return checked
 
 
 class Evalio(Estimator[EvalioConfig]):
@@ -265,7 +265,7 @@ class Evalio(Estimator[EvalioConfig]):
 
     @on(Imu)
     def imu(self, event: Imu) -> None:
-        """Keep samples until the next scan."""
+        """Store samples until the next scan."""
         if self.inertial:
             self._samples.append(event)
 
@@ -292,7 +292,7 @@ class Evalio(Estimator[EvalioConfig]):
     async def run(self) -> None:
         """Track each scan; estimates start with the first scan of enough points."""
         samples = self._samples
-        taken = deque[LidarScan](maxlen=1 + _SCANS_LATE.get(self.config.pipeline, 0))
+        tracked = deque[LidarScan](maxlen=1 + _SCANS_LATE.get(self.config.pipeline, 0))
         async for scan in self.frames:
             past = []
             while samples and samples[0].stamp <= scan.end:
@@ -300,6 +300,6 @@ class Evalio(Estimator[EvalioConfig]):
             args = scan.stamp, scan.points, scan.times, scan.rings, sample_rows(past)
             result = await self._pipeline.call(EvalioProcess.track, *args)
             if not result.lost:
-                taken.append(scan)
-            if len(taken) == taken.maxlen:
-                self.publish(scan if result.lost else taken[0], result)
+                tracked.append(scan)
+            if len(tracked) == tracked.maxlen:
+                self.publish(scan if result.lost else tracked[0], result)

@@ -87,8 +87,8 @@ def _structure(line: str) -> type[c.Structure]:
     name, _, declarations = line.partition(": ")
     members = re.findall(r"(\w+) (\w+)(?:\[(\d+)\])?", declarations)
     fields = [(field, _TYPES[kind] * int(n) if n else _TYPES[kind]) for kind, field, n in members]
-    made = _TYPES[name] = type(name, (c.Structure,), {"_fields_": fields})
-    return made
+    structure = _TYPES[name] = type(name, (c.Structure,), {"_fields_": fields})
+    return structure
 
 
 Config, ImuSample, ImageSample, PoseData, *_calibrations = map(
@@ -118,8 +118,8 @@ class Library:
         if version[0].value not in {1, 2, 3}:
             actual = ".".join(str(part.value) for part in version)
             raise VitError(f"{path}: expected version 1 to 3 of the VIT interface, found {actual}")
-        given = Config(None if config is None else str(config).encode(), cameras, 1, False)
-        self._call("tracker_create", c.byref(given), c.byref(self._tracker))
+        library_config = Config(None if config is None else str(config).encode(), cameras, 1, False)
+        self._call("tracker_create", c.byref(library_config), c.byref(self._tracker))
 
     def start(self, calibrations: Sequence[c.Structure]) -> None:
         """Add the calibrations to the tracker, and start its threads."""
@@ -199,7 +199,7 @@ class VitTracker:
         rig: The cameras, the left one first, and the IMU.
 
     Raises:
-        VitError: It cannot be used, or refuses what it is told.
+        VitError: It cannot be used, or refuses the settings.
     """
 
     def __init__(self, library: str, config: str, files: dict[str, str] | None, rig: Rig) -> None:
@@ -207,7 +207,7 @@ class VitTracker:
         self._camera = camera_in_imu(rig, rig.cameras[0])
         self._world = np.eye(4)  # the library's, in the optical camera at its first pose
         self._pose = np.eye(4)
-        self._anew = True
+        self._is_reset = True
         self._maps = 0  # put where the camera was last known to be
         with contextlib.ExitStack() as opened:
             folder = opened.enter_context(tempfile.TemporaryDirectory(prefix="vit_"))
@@ -256,15 +256,15 @@ class VitTracker:
         numbers = np.array([*data.position, *data.orientation, *data.velocity], np.float64)
         if not np.isfinite(numbers).all() or not numbers[3:7].any():
             if self._library.reset():
-                self._maps += not self._anew
-                self._anew = True
+                self._maps += not self._is_reset
+                self._is_reset = True
             return TrackingResult(self._pose, True, "the library's pose is not finite")
         in_world = np.eye(4)
         in_world[:3, :3] = Rotation.from_quat(numbers[3:7]).as_matrix()
         in_world[:3, 3] = numbers[:3]
         in_world = in_world @ self._camera
-        if self._anew:
-            self._world, self._anew = self._pose @ inverse(in_world), False
+        if self._is_reset:
+            self._world, self._is_reset = self._pose @ inverse(in_world), False
         self._pose = self._world @ in_world
         return TrackingResult(
             self._pose, velocity=self._world[:3, :3] @ numbers[7:], map=self._maps
@@ -292,7 +292,7 @@ def calibrations(rig: Rig) -> list[c.Structure]:
     Raises:
         ValueError: Cameras and IMU are not on one body.
     """
-    made = []
+    structures = []
     for number, camera in enumerate(rig.cameras):
         info, lens, model = camera.info, camera.info.distortion, KB4
         if info.is_pinhole:
@@ -303,7 +303,7 @@ def calibrations(rig: Rig) -> list[c.Structure]:
         pinhole = (info.fx, info.fy, info.cx, info.cy)
         pose = tuple(camera_in_imu(rig, camera).ravel().tolist())
         sizes = (number, info.width, info.height, camera.rate)
-        made.append(CameraCalibration(*sizes, pinhole, model, len(lens), lens, pose))
+        structures.append(CameraCalibration(*sizes, pinhole, model, len(lens), lens, pose))
     if (imu := rig.imu) is not None:
         noisy = []
         for kind in ("accelerometer", "gyroscope"):
@@ -311,8 +311,8 @@ def calibrations(rig: Rig) -> list[c.Structure]:
             matrix, walk, density = (getattr(imu, f"{kind}_{name}") for name in names)
             corrects = tuple(np.linalg.inv(np.reshape(matrix, (3, 3))).ravel().tolist())
             noisy.append(InertialCalibration(corrects, (0.0,) * 3, (walk,) * 3, (density,) * 3))
-        made.append(ImuCalibration(0, imu.rate, *noisy))
-    return made
+        structures.append(ImuCalibration(0, imu.rate, *noisy))
+    return structures
 
 
 class Frame(NamedTuple):
@@ -370,7 +370,7 @@ class Vit(Estimator[VitConfig]):
 
     deterministic: ClassVar[bool] = False
     needs = frozenset({"grey"})
-    lenses = frozenset(COEFFICIENTS)  # the library is told the model
+    lenses = frozenset(COEFFICIENTS)  # the library gets the model
     inertial = True
     aligned = False
 
@@ -383,7 +383,7 @@ class Vit(Estimator[VitConfig]):
         self.method = Path(self.config.library).stem.removeprefix("lib") or "VIT"
         self._hold: Hold[TrackingResult]
         self._first: tuple[int, float] | None = None  # stamp and real time of the first image
-        self._said = False
+        self._has_result = False
         self._pose = np.eye(4)
 
     def refusal(self, camera: CameraAnnouncement) -> str:
@@ -421,22 +421,26 @@ class Vit(Estimator[VitConfig]):
         self._tracker = await start
 
     async def run(self) -> None:
-        """Have the library track each exposure, and hand its poses to whoever waits for them."""
+        """Track each exposure by the library, and answer waiting frames by its poses."""
         hold, config = self._hold, self.config
         async for *images, samples in self.frames:
             stamp = self.exposed_at(images[0])
             now = time.monotonic()
             self._first = (stamp, now) if self._first is None else self._first
-            since, began = (stamp - self._first[0]) / 1e9, now - self._first[1]
+            elapsed_stamps, elapsed = (stamp - self._first[0]) / 1e9, now - self._first[1]
             owed = hold.owe(stamp)
             self.start(self._deliver(images[0], owed))
-            early = not self._said and since < config.hold.initialise
-            wait = patience_left(config.patience, since, began) if early else config.hold.max_wait
+            early = not self._has_result and elapsed_stamps < config.hold.initialise
+            wait = (
+                patience_left(config.patience, elapsed_stamps, elapsed)
+                if early
+                else config.hold.max_wait
+            )
             pixels = [image.data for image in images]
             arguments = stamp, pixels, samples, float(wait) if hold.expects else 0.0
-            for of, result in await self._tracker.call(VitTracker.track, *arguments):
-                self._said = True
-                hold.answer(of, result, "lost" if result.lost else "")
+            for result_stamp, result in await self._tracker.call(VitTracker.track, *arguments):
+                self._has_result = True
+                hold.answer(result_stamp, result, "lost" if result.lost else "")
             if early and not owed.work.done():
                 hold.answer(stamp, None, "initialising")
 
@@ -446,5 +450,5 @@ class Vit(Estimator[VitConfig]):
         if result is not None:
             self._pose = result.pose
             self.send_result(image, result)
-        elif self._said:
+        elif self._has_result:
             self.send_result(image, TrackingResult(self._pose, True, "the library gave no pose"))

@@ -151,14 +151,14 @@ class RosTopics:
         self.server.declare_ros(topic.name, topic.type, self._definitions[topic.type])
         return RosTopic(self, topic)
 
-    def stamped(self, put: Callable[[E], None]) -> Callable[[E], None]:
-        """Return `put`, whose messages then have the time of their event."""
+    def stamped(self, publish: Callable[[E], None]) -> Callable[[E], None]:
+        """Return `publish`, whose messages then have the time of their event."""
 
-        def put_stamped(event: E) -> None:
+        def publish_stamped(event: E) -> None:
             self._stamps.stamp = event.stamp
-            put(event)
+            publish(event)
 
-        return put_stamped
+        return publish_stamped
 
     @property
     def stamp(self) -> int:
@@ -172,17 +172,17 @@ class RosTopic:
     def __init__(self, topics: RosTopics, topic: Topic) -> None:
         self.topic, self._topics = topic, topics
         cloud = topic.type == "sensor_msgs/msg/PointCloud2"
-        self._kept = topic.qos.transient_local or (cloud and topic.qos.reliable)
+        self._is_latched = topic.qos.transient_local or (cloud and topic.qos.reliable)
 
     @property
     def wanted(self) -> bool:
-        """Tell whether the topic has a viewer, or keeps messages for later viewers."""
-        return self._kept or self._topics.server.wanted(self.topic.name)
+        """Return whether the topic has a viewer, or stores messages for later viewers."""
+        return self._is_latched or self._topics.server.wanted(self.topic.name)
 
     def put(self, message: bytearray) -> None:
         """Send a message to the topic's viewers."""
         data, server, stamp = bytes(message), self._topics.server, self._topics.stamp
-        if self._kept:
+        if self._is_latched:
             server.latch(self.topic.name, lambda: data, stamp)
         else:
             server.log(self.topic.name, data, stamp)
@@ -218,7 +218,7 @@ class Publishing:
         self._ros: RosPublishing[RosTopic]
         self._ros = RosPublishing(topics, store, published, Stamps().out)
         self._ros.warm_up()
-        self._put = topics.stamped(self._ros.put)
+        self._publish_ros = topics.stamped(self._ros.put)
         self._names = self._ros.names
         self._frames: dict[str, str] = {}  # sources of images, by optical frame
         self._estimators: dict[str, str] = {}  # parent frames, by source
@@ -246,12 +246,12 @@ class Publishing:
                 )
 
     def begin(self) -> None:
-        """Put the messages for the whole run."""
+        """Publish the messages that are valid for the whole run."""
         self._ros.begin()
         self._server.latch("/scene", self._whole_scene, 0)
 
     def features(self, event: TrackedFeatures) -> None:
-        """Put an estimator's tracked features of an image; beside the loop."""
+        """Publish an estimator's tracked features of an image; beside the loop."""
         if (camera := self._frames.get(event.frame_id)) is not None:
             topic = f"/{ros_name(camera)}/features/{ros_name(event.source)}"
             self._server.declare(topic, "ImageAnnotations")
@@ -259,11 +259,11 @@ class Publishing:
                 self._server.log(topic, self._make.features(event), event.stamp)
 
     def put(self, event: Event) -> None:
-        """Put an event's messages: of images and clouds beside the loop, of others on the loop."""
+        """Publish an event: images and clouds beside the loop, others on the loop."""
         match event:
             case PointCloud():  # in the frame of an estimator if it is that
                 frame = self._renamed.get(event.frame_id, event.frame_id)
-                self._put(msgspec.structs.replace(event, frame_id=frame))
+                self._publish_ros(msgspec.structs.replace(event, frame_id=frame))
             case Odometry():
                 self._odometry(event)
             case PoseEstimate():
@@ -275,24 +275,24 @@ class Publishing:
             case TrackingEvent() | VehicleEvent():
                 self._server.log("/log", self._make.log(event), event.stamp)
             case _:
-                self._put(event)
+                self._publish_ros(event)
 
     def _odometry(self, event: Odometry) -> None:
         source = event.source
         self._vehicle(source, event.child_frame_id)
-        self._put(event)
+        self._publish_ros(event)
         self._truths[source].add(event.stamp, event.position, event.orientation)
         colour = truth_colour(list(self._truths).index(source))
         self._extend(f"truth/{source}", event.frame_id, colour, event)
 
     def _estimate(self, event: PoseEstimate) -> None:
-        """Put an estimate, laid on the truth unless in ``map``, and ``<estimator>/<body>``."""
+        """Publish an estimate (aligned unless in ``map``) and its transform."""
         source, body = event.source, f"{event.source}/{event.child_frame_id}"
         parent = self._estimators.get(source)
         if parent is None:
-            parent = self._estimators[source] = self._parent_of(event)
+            parent = self._estimators[source] = self._parent_frame(event)
             self._names.own.add(body)
-        self._put(msgspec.structs.replace(event, frame_id=parent))
+        self._publish_ros(msgspec.structs.replace(event, frame_id=parent))
         self._place(event, parent, body, (event.position, event.orientation))
         colour = estimate_colour(list(self._estimators).index(source))
         self._extend(f"estimate/{source}", parent, colour, event)
@@ -304,7 +304,7 @@ class Publishing:
                 source, self._names.name(frame_id, source)
             )
 
-    def _parent_of(self, event: PoseEstimate) -> str:
+    def _parent_frame(self, event: PoseEstimate) -> str:
         """Return an estimator's parent frame; its own frame is first aligned with the truth."""
         if event.frame_id == "map":
             return "map"
@@ -319,7 +319,7 @@ class Publishing:
     def _place(
         self, event: Event, parent: str, child: str, pose: Pose, *, static: bool = False
     ) -> None:
-        self._put(
+        self._publish_ros(
             TransformStamped(
                 stamp=event.stamp,
                 source=event.source,
@@ -396,11 +396,11 @@ class FoxgloveServer(Node[FoxgloveConfig]):
             return
         loop, logged = asyncio.get_running_loop(), set[str]()
 
-        def refused(why: str) -> None:
-            if why not in logged and len(logged) < _REFUSALS:
-                logged.add(why)
+        def refused(reason: str) -> None:
+            if reason not in logged and len(logged) < _REFUSALS:
+                logged.add(reason)
                 with contextlib.suppress(RuntimeError):  # the run is over
-                    loop.call_soon_threadsafe(self.log.warning, "somebody was refused: %s", why)
+                    loop.call_soon_threadsafe(self.log.warning, "somebody was refused: %s", reason)
 
         try:
             server = await self.offload(Server, self.config, f"visnav: {self.name}", refused)
@@ -423,8 +423,8 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         assert publishing is not None
         publishing.begin()
         for kind, events in self._queues.items():
-            put = publishing.features if kind is TrackedFeatures else publishing.put
-            self.start(self._pass_on(events, put))
+            publish = publishing.features if kind is TrackedFeatures else publishing.put
+            self.start(self._pass_on(events, publish))
 
     async def on_shutdown(self) -> None:
         """Stop listening."""
@@ -467,6 +467,6 @@ class FoxgloveServer(Node[FoxgloveConfig]):
         if self._server is not None:
             self._server.send_time(self.clock.now())
 
-    async def _pass_on(self, events: Stream[Any], put: Callable[[Any], None]) -> None:
+    async def _pass_on(self, events: Stream[Any], publish: Callable[[Any], None]) -> None:
         async for event in events:
-            await self.offload(put, event)
+            await self.offload(publish, event)

@@ -62,7 +62,7 @@ class Gate:
         threading.Thread(target=self._listen, name="foxglove gate", daemon=True).start()
 
     def close(self) -> None:
-        """Let nobody in any more, and end all connections."""
+        """Stop listening, and close all connections."""
         with self._lock:
             self._closed = True
             open_ = [self._listener, *self._open]
@@ -109,7 +109,7 @@ class Gate:
         try:
             viewer.settimeout(_HEAD_TIMEOUT)
             try:
-                head, rest = _read_head(viewer)
+                head, remaining = _read_head(viewer)
                 self.check(head.decode("latin-1"))
             except HttpError as error:
                 status, text = error.args
@@ -123,11 +123,11 @@ class Gate:
             server.connect(self._inside)
             for end in (viewer, server):
                 end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, True)
-            server.sendall(head + rest)
-            back = threading.Thread(target=_pass_on, args=(server, viewer), daemon=True)
-            back.start()
+            server.sendall(head + remaining)
+            thread = threading.Thread(target=_pass_on, args=(server, viewer), daemon=True)
+            thread.start()
             _pass_on(viewer, server)
-            back.join()
+            thread.join()
         except OSError:
             pass
         finally:
@@ -265,7 +265,7 @@ class Server:
         )
 
     def wanted(self, topic: str) -> bool:
-        """Tell whether anybody looks at a topic."""
+        """Return whether a topic has a viewer."""
         return bool(self._channels[topic].has_sinks())
 
     def log(self, topic: str, message: Any, stamp: int) -> None:

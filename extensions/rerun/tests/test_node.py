@@ -151,7 +151,7 @@ def test_a_viewer_that_stands_still_is_not_waited_for(monkeypatch: pytest.Monkey
     assert left_out >= 10  # the rest lies in the buffers between the two
     viewer.send_signal(signal.SIGCONT)
     end = time.monotonic() + 30.0
-    while not recorder._taken() and time.monotonic() < end:
+    while not recorder._viewer_keeps_up() and time.monotonic() < end:
         pass  # it waits for the viewer, a process, which has a clock of its own
     recorder.log([(20, large)])
     assert recorder.left_out() == left_out

@@ -69,8 +69,8 @@ def camera(announced: CameraAnnouncement, vehicles: Sequence[str]) -> str:
     source = announced.source
     if announced.parent_frame_id == "map":
         return path(WORLD, "cameras", source)
-    known = any(source.startswith(f"{vehicle}/") for vehicle in vehicles)
-    return path(WORLD, *([] if known else vehicles[:1]), source)
+    has_vehicle = any(source.startswith(f"{vehicle}/") for vehicle in vehicles)
+    return path(WORLD, *([] if has_vehicle else vehicles[:1]), source)
 
 
 E = TypeVar("E", bound=Event)
@@ -87,16 +87,16 @@ class EntityLog:
         stream.set_log_time_enabled(False)  # one's own time lines: ``run`` and ``event``
         stream.set_log_tick_enabled(False)
 
-    def put(self, entity: str, *what: Any) -> None:
+    def add(self, entity: str, *components: Any) -> None:
         """Log components of an entity at the time `now`."""
         number, stamp = self.now
         self.stream.set_time("event", sequence=number)
         self.stream.set_time("run", duration=np.timedelta64(stamp, "ns"))
-        self.stream.log(entity, *what)
+        self.stream.log(entity, *components)
 
-    def static(self, entity: str, *what: Any) -> None:
+    def static(self, entity: str, *components: Any) -> None:
         """Log components for the whole run."""
-        self.stream.log(entity, *what, static=True)
+        self.stream.log(entity, *components, static=True)
 
     def columns(self, entity: str, events: Sequence[Numbered[E]], columns: Iterable[Any]) -> None:
         """Log rows at once, a row for each event."""
@@ -133,8 +133,8 @@ def layout(
     rows = [rrb.Horizontal(*above, column_shares=[2.4, 1.0][: len(above)])]
     legend = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop)
     curves = [
-        rrb.TimeSeriesView(name=title, origin="/", contents=what, plot_legend=legend)
-        for title, what in plots.items()
+        rrb.TimeSeriesView(name=title, origin="/", contents=entities, plot_legend=legend)
+        for title, entities in plots.items()
     ]
     if len(curves) > _ABREAST:  # the rest share the last place
         curves[_ABREAST - 1 :] = [rrb.Tabs(*curves[_ABREAST - 1 :])]
@@ -165,9 +165,9 @@ def _world(rrb: Any, trails: list[str], cameras: dict[str, list[str]], eye: Eye 
     # camera that has nothing else is shown by its depth.
     hidden = [
         f"- /{camera}/{kind}/**"
-        for camera, there in cameras.items()
+        for camera, entity in cameras.items()
         for kind in ("depth", "segmentation", "rgb/features", "grey/features")
-        if kind != "depth" or there != ["depth"]
+        if kind != "depth" or entity != ["depth"]
     ]
     return rrb.Spatial3DView(
         name="world: true path green, planned path grey, estimates as in the plots",
@@ -222,17 +222,19 @@ class Plots:
     """Writes curves and the log."""
 
     def __init__(self, log: EntityLog, colours: Mapping[str, Colour]) -> None:
-        self._to = log
+        self._entity_log = log
         self._colours = colours
-        self._known: set[str] = set()
+        self._styled: set[str] = set()
         self.plotted: set[str] = set()  # parts of the tree with curves
 
     def titles(self) -> dict[str, str]:
         """Return the plots with something to show: the entities of each, by title."""
-        return {t: what for t, what in PLOTS.items() if what.split("/")[1] in self.plotted}
+        return {
+            t: entities for t, entities in PLOTS.items() if entities.split("/")[1] in self.plotted
+        }
 
     def measurements(self, kind: type[Event], source: str, events: Sequence[Numbered[Any]]) -> None:
-        """Put the measurements of a sensor."""
+        """Log the measurements of a sensor."""
         self.plotted.add(GROUPS[kind])
         for field in fields_of(kind):
             entity = path(GROUPS[kind], field, source)
@@ -241,43 +243,49 @@ class Plots:
                 self._style(entity, colors=_AXES, names=["x", "y", "z"])
             else:
                 self._style(entity, names=[source])
-            self._to.columns(entity, events, self._to.rr.Scalars.columns(scalars=rows))
+            self._entity_log.columns(
+                entity, events, self._entity_log.rr.Scalars.columns(scalars=rows)
+            )
         if kind is NavSatFix:
             places = np.array([(event.latitude, event.longitude) for _, event in events])
-            columns = self._to.rr.GeoPoints.columns(positions=places)
-            self._to.columns(path("gps", source), events, columns)
+            columns = self._entity_log.rr.GeoPoints.columns(positions=places)
+            self._entity_log.columns(path("gps", source), events, columns)
 
     def scores(self, _: str, events: Sequence[Numbered[Score]]) -> None:
-        """Put scores, of any subject and metric."""
+        """Log scores, of any subject and metric."""
         self.plotted.add("scores")
-        apart: dict[tuple[str, str, str], list[Numbered[Score]]] = {}
+        by_key: dict[tuple[str, str, str], list[Numbered[Score]]] = {}
         for number, event in events:
             key = event.subject, event.metric, event.unit
-            apart.setdefault(key, []).append((number, event))
-        for (subject, metric, unit), scores in apart.items():
+            by_key.setdefault(key, []).append((number, event))
+        for (subject, metric, unit), scores in by_key.items():
             entity = path("scores", metric, subject)
-            shown, factor = _HANDY.get(unit, (unit, 1.0))
+            shown_unit, factor = _HANDY.get(unit, (unit, 1.0))
             style = {"colors": [self._colours[subject]]} if subject in self._colours else {}
-            name = subject if metric in _TITLED else f"{subject} ({shown})"
+            name = subject if metric in _TITLED else f"{subject} ({shown_unit})"
             self._style(entity, names=[name], **style)
             values = np.array([event.value for _, event in scores]) * factor
-            self._to.columns(entity, scores, self._to.rr.Scalars.columns(scalars=values))
+            self._entity_log.columns(
+                entity, scores, self._entity_log.rr.Scalars.columns(scalars=values)
+            )
 
-    def note(self, source: str, text: str) -> None:
-        """Put a note of the whole run into the log."""
-        note = self._to.rr.TextLog(f"{source}: {text}", level="WARN")
-        self._to.static(path(LOG, "notes", source), note)
+    def log_note(self, source: str, text: str) -> None:
+        """Log a note for the whole run."""
+        entry = self._entity_log.rr.TextLog(f"{source}: {text}", level="WARN")
+        self._entity_log.static(path(LOG, "notes", source), entry)
 
     def logged(self, event: Event) -> None:
-        """Put an event into the log, in words."""
+        """Log an event as text."""
         text = f"{event.source}: {describe(event)}"
         lost = isinstance(event, TrackingLost)
-        self._to.put(LOG, self._to.rr.TextLog(text, level="WARN" if lost else "INFO"))
+        self._entity_log.add(
+            LOG, self._entity_log.rr.TextLog(text, level="WARN" if lost else "INFO")
+        )
 
     def _style(self, entity: str, **style: Any) -> None:
-        if entity not in self._known:
-            self._known.add(entity)
-            self._to.static(entity, self._to.rr.SeriesLines(**style))
+        if entity not in self._styled:
+            self._styled.add(entity)
+            self._entity_log.static(entity, self._entity_log.rr.SeriesLines(**style))
 
 
 class ColouredPoints(msgspec.Struct, frozen=True, eq=False):
@@ -308,8 +316,8 @@ class ScenePoints:
         self._depth: DepthImage | None = None
         self._poses: deque[PoseStamped] = deque(maxlen=REMEMBERED)
 
-    def take(self, event: Image | DepthImage | PoseStamped) -> ColouredPoints | None:
-        """Take an image, depth or pose; return the points when all are there and a set is due."""
+    def add(self, event: Image | DepthImage | PoseStamped) -> ColouredPoints | None:
+        """Add an image, depth or pose; return the points when a set is complete and due."""
         match event:
             case Image():
                 self._image = event
@@ -332,11 +340,13 @@ class ScenePoints:
         size = (self._info.height, self._info.width)
         if depth.data.shape != size or image.data.shape[:2] != size:
             return None
-        seen, where = back_project(depth.data[pixels, pixels], self._rays, self._max_distance)
-        colours = image.data[pixels, pixels][where]
+        points_in_camera, mask = back_project(
+            depth.data[pixels, pixels], self._rays, self._max_distance
+        )
+        colours = image.data[pixels, pixels][mask]
         if colours.ndim == 1:
             colours = np.repeat(colours[:, None], 3, axis=1)
         placed = pose_matrix(pose.position, pose.orientation)
-        points = seen.astype(np.float64) @ placed[:3, :3].T + placed[:3, 3]
+        points = points_in_camera.astype(np.float64) @ placed[:3, :3].T + placed[:3, 3]
         low = points[:, 2] > pose.position[2] - self._max_height  # z points down
         return ColouredPoints(image.stamp, points[low].astype(np.float32), colours[low])

@@ -84,7 +84,7 @@ class Recorder:
         self._entities = EntityLog(library, self._stream)
         self._world = World(self._entities, config)
         world, self._plots = self._world, Plots(self._entities, self._world.colours)
-        self._puts: dict[type[Event], Callable[[Any], None]] = {
+        self._log_functions: dict[type[Event], Callable[[Any], None]] = {
             Image: world.image,
             DepthImage: world.depth,
             SegmentationImage: world.segmentation,
@@ -105,7 +105,7 @@ class Recorder:
             **{kind: functools.partial(self._plots.measurements, kind) for kind in GROUPS},
             Score: self._plots.scores,
         }
-        self._shown: tuple[int, ...] = ()
+        self._shown_counts: tuple[int, ...] = ()
         self._closed = False
         self._behind = False
         self._left_out = 0
@@ -116,7 +116,7 @@ class Recorder:
         return "" if self._viewer is None else self._viewer.page
 
     def begin(self, announcements: Iterable[Announcement]) -> None:
-        """Put the announced entities, for the whole run."""
+        """Log the announced entities, for the whole run."""
         vehicles_first = sorted(announcements, key=lambda a: not isinstance(a, VehicleAnnouncement))
         for announcement in vehicles_first:
             match announcement:
@@ -132,12 +132,12 @@ class Recorder:
                 case CameraAnnouncement():
                     self._world.camera(announcement)
                     if not announcement.info.is_pinhole:
-                        self._plots.note(announcement.source, _NO_DISTORTION)
+                        self._plots.log_note(announcement.source, _NO_DISTORTION)
         self._show()
 
     def log(self, batch: Sequence[Numbered[Event]]) -> None:
-        """Put events, in the order of arrival; a file's are gathered, for fewer heads of rows."""
-        if self._viewer is not None and not self._taken():
+        """Log events, in the order of arrival; a file's are gathered, for fewer heads of rows."""
+        if self._viewer is not None and not self._viewer_keeps_up():
             self._left_out += len(batch)
             return
         self._waiting += batch
@@ -150,21 +150,28 @@ class Recorder:
         for _, event in batch:
             if isinstance(event, TrackedFeatures):
                 self._world.vehicles.tracked(event)  # before the estimates are placed
-        together: dict[type[Event], dict[str, list[Any]]] = {kind: {} for kind in self._columns}
+        by_source: dict[type[Event], dict[str, list[Any]]] = {kind: {} for kind in self._columns}
         for number, event in batch:
-            kind = next((kind for kind in together if isinstance(event, kind)), None)
+            kind = next((kind for kind in by_source if isinstance(event, kind)), None)
             if kind is not None:
-                together[kind].setdefault(event.source, []).append((number, event))
-        for kind, sources in together.items():
+                by_source[kind].setdefault(event.source, []).append((number, event))
+        for kind, sources in by_source.items():
             for source, events in sources.items():
                 self._columns[kind](source, events)
                 if kind is Wind:
                     self._world.wind(source, events)
         for number, event in batch:
             self._entities.now = number, event.stamp
-            put = next((put for kind, put in self._puts.items() if isinstance(event, kind)), None)
-            if put is not None:
-                put(event)
+            log_event = next(
+                (
+                    log_event
+                    for kind, log_event in self._log_functions.items()
+                    if isinstance(event, kind)
+                ),
+                None,
+            )
+            if log_event is not None:
+                log_event(event)
         self._show()
 
     def left_out(self) -> int:
@@ -183,15 +190,15 @@ class Recorder:
             self._stream.flush()
             self._stream.disconnect()
             return ""
-        trouble = ""
-        if self._taken():
+        problem = ""
+        if self._viewer_keeps_up():
             self._stream.disconnect()
         else:  # a window that was closed, or a viewer that stands still: it would wait for that
-            trouble = self._viewer.last_words() or "it took nothing any more"
+            problem = self._viewer.last_words() or "it took nothing any more"
         self._viewer.close()
-        return trouble
+        return problem
 
-    def _taken(self) -> bool:
+    def _viewer_keeps_up(self) -> bool:
         """Return whether a viewer takes the logged data in time; if late before, wait briefly."""
         try:
             self._stream.flush(timeout_sec=_SECOND_TIMEOUT if self._behind else _TIMEOUT)
@@ -208,9 +215,9 @@ class Recorder:
             len(self._plots.plotted),
             *(len(kinds) for kinds in images.values()),
         )
-        if counts == self._shown and eye is None:
+        if counts == self._shown_counts and eye is None:
             return
-        self._shown = counts
+        self._shown_counts = counts
         plots = self._plots.titles()
         self._stream.send_blueprint(layout(self._rrb, self._world.trails, images, plots, eye))
 
@@ -248,7 +255,7 @@ class RerunView(Node[RerunConfig]):
         self._announcements: list[Announcement] = []
         self._received = 0
         self._recorder: Any = None
-        self._begun = False
+        self._has_begun = False
         self._selection = ImageSelection(self.config.image_rate)
         self._large: Stream[Numbered[Event]] = Stream(f"{self.name}.large", _LARGE, "drop_oldest")
         self._small: Stream[Numbered[Event]] = Stream(f"{self.name}.small", _SMALL, "drop_oldest")
@@ -274,7 +281,7 @@ class RerunView(Node[RerunConfig]):
 
     @on(Image, DepthImage, SegmentationImage)
     def images(self, event: Image | DepthImage | SegmentationImage) -> None:
-        """Keep some images."""
+        """Queue selected images."""
         self._received += 1
         kind = type(event).__name__
         if self._selection.select(kind, event.source, event.frame_id, event.stamp):
@@ -282,14 +289,14 @@ class RerunView(Node[RerunConfig]):
 
     @on(TrackedFeatures)
     def features(self, event: TrackedFeatures) -> None:
-        """Keep the features of those images."""
+        """Queue the features of the selected images."""
         self._received += 1
         if self._selection.selected(event.frame_id, event.stamp):
             self._large.offer((self._received, event))
 
     @on(PointCloud, LidarScan)
     def point_clouds(self, event: PointCloud | LidarScan) -> None:
-        """Keep clouds, and turns of lidars."""
+        """Queue clouds, and turns of lidars."""
         self._received += 1
         self._large.offer((self._received, event))
 
@@ -310,13 +317,13 @@ class RerunView(Node[RerunConfig]):
         self._small.offer((self._received, event))
 
     async def run(self) -> None:
-        """Pass on the waiting events; in lockstep the run goes on for one period meanwhile."""
+        """Pass on the waiting events; in lockstep the run continues for one period meanwhile."""
         if self._recorder is None:
             return
         await self._begin()
         period = 1.0 / self.config.update_rate
         while True:
-            batch = self._take()
+            batch = self._next_batch()
             if batch:
                 await self._recorder.call_for(period, Recorder.log, batch)
             else:
@@ -327,10 +334,10 @@ class RerunView(Node[RerunConfig]):
         if self._recorder is None:
             return
         await self._begin()
-        while batch := self._take():
+        while batch := self._next_batch():
             await self._recorder.call_for(0.0, Recorder.log, batch)
-        if trouble := await self._recorder.call_for(0.0, Recorder.close):
-            self.log.warning("the viewer has not got everything: %s", trouble)
+        if problem := await self._recorder.call_for(0.0, Recorder.close):
+            self.log.warning("the viewer has not got everything: %s", problem)
         dropped = self._large.dropped + self._small.dropped
         dropped += await self._recorder.call_for(0.0, Recorder.left_out)
         if dropped:
@@ -341,11 +348,11 @@ class RerunView(Node[RerunConfig]):
             self.log.info("%s: rerun opens it", part_name(self, self.config.file))
 
     async def _begin(self) -> None:
-        if not self._begun:
-            self._begun = True
+        if not self._has_begun:
+            self._has_begun = True
             await self._recorder.call_for(0.0, Recorder.begin, self._announcements)
 
-    def _take(self) -> list[Numbered[Event]]:
+    def _next_batch(self) -> list[Numbered[Event]]:
         batch = [
             stream.receive_nowait()
             for stream in (self._large, self._small)

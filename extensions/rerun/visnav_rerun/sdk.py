@@ -169,8 +169,8 @@ class Viewer:
             with contextlib.suppress(OSError), socket.create_connection((host, port), 1.0):
                 return
             time.sleep(0.05)
-        words = self.last_words() or f"nothing in {_TIMEOUT:g} s"
-        raise VisnavError(f"expected Rerun to listen on {host}:{port}, found: {words}")
+        output = self.last_words() or f"nothing in {_TIMEOUT:g} s"
+        raise VisnavError(f"expected Rerun to listen on {host}:{port}, found: {output}")
 
 
 def program() -> str:

@@ -58,7 +58,7 @@ class World:
     """Writer of the entities with a place in the world."""
 
     def __init__(self, log: EntityLog, config: RerunConfig) -> None:
-        self._to = log
+        self._entity_log = log
         self._rr = log.rr
         self._config = config
         self._truth: dict[str, RecentPoses] = {}
@@ -68,7 +68,8 @@ class World:
         self._moving: set[str] = set()  # bodies that move by themselves
         self._wind_due: dict[str, int] = {}  # by vehicle
         self.vehicles = Vehicles()
-        self._others: dict[str, str] = {}  # entities of bodies and of estimators' own, by frame
+        # Entities of bodies' and of estimators' own frames, by frame.
+        self._other_frames: dict[str, str] = {}
         self._scene_points: dict[str, ScenePoints] = {}  # by source
         self._anchored: set[str] = set()
         self._paths: dict[str, tuple[PathPieces, Colour, float]] = {}
@@ -80,7 +81,7 @@ class World:
         self.bounds = np.array([[np.inf] * 3, [-np.inf] * 3])  # lowest, highest (``map``, m)
         log.static(entities.WORLD, self._rr.ViewCoordinates.FRD)
 
-    # What there is.
+    # Announced entities.
 
     def vehicle(self, source: str) -> None:
         """Prepare a vehicle: a body with four rotors, and its axes."""
@@ -90,7 +91,7 @@ class World:
         colour = truth_colour(len(self._truth))
         self._truth[source] = RecentPoses()
         entity = entities.world(source)
-        self._to.static(
+        self._entity_log.static(
             f"{entity}/shape",
             self._rr.Boxes3D(
                 centers=[box.centre for box in VEHICLE],
@@ -99,7 +100,7 @@ class World:
                 fill_mode="solid",
             ),
         )
-        self._to.static(entity, self._rr.TransformAxes3D(0.4))
+        self._entity_log.static(entity, self._rr.TransformAxes3D(0.4))
         self._path(entities.world("truth", source), colour, _THICK)
 
     def estimator(self, source: str) -> None:
@@ -120,7 +121,9 @@ class World:
         self.images[entity] = kinds if config.image_rate else []
         twin = entity.startswith(f"{self._frames[announced.frame_id]}/")  # undistorted images
         if announced.parent_frame_id != "map" and not twin:
-            self._to.static(entity, self._transform(announced.position, announced.orientation))
+            self._entity_log.static(
+                entity, self._transform(announced.position, announced.orientation)
+            )
         for kind in announced.images:
             self._pinhole(f"{entity}/{kind}", info, config.depth_stride if kind == "depth" else 1)
         if "depth" in announced.images and config.points_rate and config.image_rate:
@@ -137,26 +140,28 @@ class World:
         """Prepare a sensor: mounting on its vehicle."""
         entity = entities.world(announced.source)
         if announced.frame_id != announced.parent_frame_id:
-            self._to.static(entity, self._transform(announced.position, announced.orientation))
+            self._entity_log.static(
+                entity, self._transform(announced.position, announced.orientation)
+            )
 
     def moving_body(self, announced: BodyAnnouncement) -> None:
         """Prepare a self-moving body, and its path."""
         box, entity = moving_body(announced.kind), entities.world(announced.source)
         shape = self._rr.Boxes3D(centers=[box.centre], sizes=[box.size], colors=[box.colour])
-        self._to.static(f"{entity}/shape", shape)
+        self._entity_log.static(f"{entity}/shape", shape)
         self._path(entities.world("paths", announced.source), box.colour, _THIN)
         self._moving.add(announced.source)
 
-    # What moves.
+    # Moving entities.
 
     def odometry(self, source: str, events: Sequence[Numbered[Odometry]]) -> None:
-        """Put a vehicle's true poses."""
+        """Log a vehicle's true poses."""
         self.vehicle(source)
-        self._others.setdefault(events[0][1].child_frame_id, entities.world(source))
+        self._other_frames.setdefault(events[0][1].child_frame_id, entities.world(source))
         truth = self._truth[source]
         for number, event in events:
             truth.add(event.stamp, event.position, event.orientation)
-            self._to.now = number, event.stamp
+            self._entity_log.now = number, event.stamp
             self._extend(entities.world("truth", source), event)
         positions = np.array([event.position for _, event in events])
         self.bounds[0] = np.minimum(self.bounds[0], positions.min(axis=0))
@@ -164,69 +169,69 @@ class World:
         self._poses(entities.world(source), events)
 
     def estimates(self, source: str, events: Sequence[Numbered[PoseEstimate]]) -> None:
-        """Put an estimator's poses, laid on the truth unless in ``map``, as in the evaluation."""
+        """Log an estimator's poses, aligned unless in ``map``, as in the evaluation."""
         self.estimator(source)
         frame_entity = entities.world("estimates", source)
         first = events[0][1]
         if source not in self._anchored:
             self._anchored.add(source)
             if first.frame_id != "map":
-                self._others.setdefault(first.frame_id, frame_entity)
+                self._other_frames.setdefault(first.frame_id, frame_entity)
                 truth = self._truth.get(self.vehicles.of(source))
                 if (frame := estimate_frame(first, truth)) is not None:
-                    self._to.static(frame_entity, self._transform(*frame))
-            self._to.static(f"{frame_entity}/body", self._rr.TransformAxes3D(0.3))
+                    self._entity_log.static(frame_entity, self._transform(*frame))
+            self._entity_log.static(f"{frame_entity}/body", self._rr.TransformAxes3D(0.3))
         for number, event in events:
-            self._to.now = number, event.stamp
+            self._entity_log.now = number, event.stamp
             self._extend(f"{frame_entity}/path", event)
         self._poses(f"{frame_entity}/body", events)
 
     def plan(self, event: Planned) -> None:
-        """Put where a vehicle is meant to be."""
+        """Log the planned position of a vehicle."""
         if self._plan.select(event):
             entity = entities.path(entities.PLAN, event.vehicle)
             self._path(entity, PLAN, _THIN)
             self._extend(entity, event)
 
     def wind(self, source: str, events: Sequence[Numbered[Wind]]) -> None:
-        """Put the wind as an arrow at its vehicle, some times a second: a metre for each m/s."""
+        """Log the wind as an arrow at its vehicle, some times a second: a metre for each m/s."""
         vehicle = source.rpartition("/")[2]
         for number, event in events:
-            there = self._truth[vehicle].at(event.stamp) if vehicle in self._truth else None
-            if there is not None and event.stamp >= self._wind_due.get(vehicle, 0):
+            pose = self._truth[vehicle].at(event.stamp) if vehicle in self._truth else None
+            if pose is not None and event.stamp >= self._wind_due.get(vehicle, 0):
                 self._wind_due[vehicle] = event.stamp + _WIND_PERIOD
-                self._to.now = number, event.stamp
+                self._entity_log.now = number, event.stamp
                 arrow = self._rr.Arrows3D(
-                    origins=[there[0]], vectors=[event.velocity], colors=[WIND], radii=[_THICK]
+                    origins=[pose[0]], vectors=[event.velocity], colors=[WIND], radii=[_THICK]
                 )
-                self._to.put(entities.world("wind", vehicle), arrow)
+                self._entity_log.add(entities.world("wind", vehicle), arrow)
 
     def pose(self, event: PoseStamped) -> None:
-        """Put the pose of a free camera or self-moving body, or of a camera, for depth images."""
+        """Log the pose of a free camera or self-moving body, or of a camera, for depth images."""
         if event.source in self._moving:
             entity = entities.world(event.source)
-            self._to.put(entity, self._transform(event.position, event.orientation))
+            self._entity_log.add(entity, self._transform(event.position, event.orientation))
             self._extend(entities.world("paths", event.source), event)
             return
         camera = self._cameras.get(event.source)
         if camera is not None and camera.parent_frame_id == "map":
             pose = self._transform(event.position, event.orientation)
-            self._to.put(self._entities[event.source], pose)
+            self._entity_log.add(self._entities[event.source], pose)
         self._extend_scene(event)
 
     # Images, features and point clouds.
 
     def image(self, event: Image) -> None:
-        """Put an image."""
+        """Log an image."""
         image = self._rr.Image(event.data)
         if quality := self._config.jpeg_quality:
             code = encode_image(event.data, "jpeg", quality).tobytes()
             image = self._rr.EncodedImage(contents=code, media_type="image/jpeg")
-        self._to.put(self._place(event, "grey" if event.data.ndim == 2 else "rgb"), image)
+        self._entity_log.add(self._place(event, "grey" if event.data.ndim == 2 else "rgb"), image)
         self._extend_scene(event)
 
     def depth(self, event: DepthImage) -> None:
-        """Put a depth image."""
+        """Log a depth image."""
         if (config := self._config).depth:
             pixels = event.data[:: config.depth_stride, :: config.depth_stride]
             image = self._rr.EncodedDepthImage(
@@ -236,46 +241,48 @@ class World:
                 colormap="turbo",
                 depth_range=(0.0, config.points_max_distance * CENTIMETRES),
             )
-            self._to.put(self._place(event, "depth"), image)
+            self._entity_log.add(self._place(event, "depth"), image)
         self._extend_scene(event)
 
     def segmentation(self, event: SegmentationImage) -> None:
-        """Put a segmentation image; class 0 is no object."""
+        """Log a segmentation image; class 0 is no object."""
         classes = np.clip(event.data + 1, 0, 65535).astype(np.uint16)
-        self._to.put(self._place(event, "segmentation"), self._rr.SegmentationImage(classes))
+        self._entity_log.add(
+            self._place(event, "segmentation"), self._rr.SegmentationImage(classes)
+        )
 
     def features(self, event: TrackedFeatures) -> None:
-        """Put an estimator's tracked features of an image."""
+        """Log an estimator's tracked features of an image."""
         if (camera := self._frames.get(event.frame_id)) is not None:
             colours = np.where(event.inliers[:, None], INLIER, OUTLIER).astype(np.uint8)
             centres = event.points + 0.5  # Rerun's pixels have their centres at halves
             points = self._rr.Points2D(centres, colors=colours, radii=2.0)
             entity = entities.path("features", event.source)
             kind = "rgb" if "rgb" in self.images[camera] else "grey"
-            self._to.put(f"{camera}/{kind}/{entity}", points)
+            self._entity_log.add(f"{camera}/{kind}/{entity}", points)
 
     def cloud(self, event: PointCloud) -> None:
-        """Put a cloud, in the world or below the owner of its frame."""
+        """Log a cloud, in the world or below the owner of its frame."""
         entity = entities.world("clouds", event.source)
-        for frames in (self._others, self._frames):
+        for frames in (self._other_frames, self._frames):
             if (owner := frames.get(event.frame_id)) is not None:
                 entity = f"{owner}/{entities.path('cloud', event.source)}"
         colours = event.colors if len(event.colors) else None
-        self._to.put(entity, self._rr.Points3D(event.points, colors=colours, radii=0.02))
+        self._entity_log.add(entity, self._rr.Points3D(event.points, colors=colours, radii=0.02))
 
     def scan(self, event: LidarScan) -> None:
-        """Put a turn of a lidar, brighter where more light came back."""
+        """Log a turn of a lidar, brighter where more light came back."""
         grey = (55.0 + 200.0 * np.clip(event.intensities, 0.0, 1.0)).astype(np.uint8)
         colours = np.stack([grey, grey, np.full_like(grey, 255)], axis=1)
         entity = f"{entities.world(event.source)}/points"
-        self._to.put(entity, self._rr.Points3D(event.points, colors=colours, radii=0.02))
+        self._entity_log.add(entity, self._rr.Points3D(event.points, colors=colours, radii=0.02))
 
     def finish(self) -> None:
-        """Put the remaining points of the paths."""
+        """Log the remaining points of the paths."""
         for entity, (path, _, _) in self._paths.items():
-            if (rest := path.rest()) is not None:
-                self._to.now = self._latest[entity]
-                self._strip(entity, rest)
+            if (remaining := path.rest()) is not None:
+                self._entity_log.now = self._latest[entity]
+                self._strip(entity, remaining)
 
     def _place(self, event: Image | DepthImage | SegmentationImage, kind: str) -> str:
         """Return an image's entity: below its camera, or by itself if the camera is unannounced."""
@@ -288,16 +295,16 @@ class World:
 
     def _extend_scene(self, event: Image | DepthImage | PoseStamped) -> None:
         scene = self._scene_points.get(event.source)
-        if scene is not None and (new := scene.take(event)) is not None:
+        if scene is not None and (new := scene.add(event)) is not None:
             points = self._rr.Points3D(new.points, colors=new.colours, radii=0.02)
-            self._to.put(entities.world("points", event.source), points)
+            self._entity_log.add(entities.world("points", event.source), points)
 
     def _pinhole(self, entity: str, info: CameraInfo, stride: int) -> None:
-        """Put how an image of every n-th pixel was taken; Rerun's centres are at halves."""
+        """Log the pinhole model of an image of every n-th pixel; Rerun's centres are at halves."""
         matrix = info.matrix()
         matrix[:2] /= stride
         matrix[:2, 2] += 0.5
-        self._to.static(
+        self._entity_log.static(
             entity,
             self._rr.Pinhole(
                 image_from_camera=matrix,
@@ -317,7 +324,7 @@ class World:
                 [(*event.orientation[1:], event.orientation[0]) for _, event in events]
             ),
         )
-        self._to.columns(entity, events, columns)
+        self._entity_log.columns(entity, events, columns)
 
     def _transform(self, position: Vector3, orientation: tuple[float, ...]) -> object:
         w, x, y, z = orientation
@@ -329,10 +336,12 @@ class World:
             self.trails.append(entity)
 
     def _extend(self, entity: str, event: Odometry | PoseEstimate | PoseStamped | Planned) -> None:
-        self._latest[entity] = self._to.now
+        self._latest[entity] = self._entity_log.now
         if (piece := self._paths[entity][0].add(event.stamp, event.position)) is not None:
             self._strip(entity, piece)
 
     def _strip(self, entity: str, piece: list[Vector3]) -> None:
         _, colour, radius = self._paths[entity]
-        self._to.put(entity, self._rr.LineStrips3D([piece], colors=[colour], radii=[radius]))
+        self._entity_log.add(
+            entity, self._rr.LineStrips3D([piece], colors=[colour], radii=[radius])
+        )

@@ -84,7 +84,7 @@ class Anchor:
 
     @property
     def maps(self) -> int:
-        """How many maps there have been."""
+        """Return how many maps there have been."""
         return len(self._first)
 
     @property
@@ -93,16 +93,16 @@ class Anchor:
         return list(self._first).index(self._map) if self._first else 0
 
     def world_may_have_changed(self, first: KeyFrame, pose: Floats) -> None:
-        """Note the present map's first key frame; `pose` is the camera in that map, (4, 4)."""
-        known = first.stamp in self._first
-        if not known:
-            begin = np.linalg.inv(pose) @ first.pose  # first key frame in the camera now
-            self._first[first.stamp] = self.last @ begin if self._first else np.eye(4)
+        """Record the present map's first key frame; `pose` is the camera in that map, (4, 4)."""
+        is_known = first.stamp in self._first
+        if not is_known:
+            first_in_camera = np.linalg.inv(pose) @ first.pose  # first key frame in the camera now
+            self._first[first.stamp] = self.last @ first_in_camera if self._first else np.eye(4)
         from_world = self._first[first.stamp] @ np.linalg.inv(first.pose)
         # The world may turn between the moment of the pose and that of the key frame's: then the
         # old one fits this pose, and the new one the next.
         old_fits = self._jump(self._from_world, pose) < self._jump(from_world, pose)
-        self._doubted = known and old_fits and not self._doubted
+        self._doubted = is_known and old_fits and not self._doubted
         if not self._doubted:
             self._from_world, self._map = from_world, first.stamp
 
@@ -111,8 +111,8 @@ class Anchor:
 
     def first(self, stamp: float) -> tuple[int, Floats] | None:
         """Return a map's number and its first key frame in our frame, by the stamp."""
-        known = enumerate(self._first.items())
-        return next(((n, pose) for n, (at, pose) in known if abs(at - stamp) < 1e-4), None)
+        entries = enumerate(self._first.items())
+        return next(((n, pose) for n, (at, pose) in entries if abs(at - stamp) < 1e-4), None)
 
     def place(self, pose: Floats) -> Floats:
         """Return a pose in the very first key frame's frame; kept as the last pose."""
@@ -123,10 +123,10 @@ class Anchor:
 def first_key_frame(trajectory: Path) -> KeyFrame | None:
     """Return the first pose of a TUM trajectory; `None` if empty."""
     with trajectory.open(encoding="ascii") as lines:
-        words = lines.readline().split()
-    if len(words) != 8:
+        fields = lines.readline().split()
+    if len(fields) != 8:
         return None
-    stamp, x, y, z, qx, qy, qz, qw = map(float, words)
+    stamp, x, y, z, qx, qy, qz, qw = map(float, fields)
     return KeyFrame(stamp, pose_matrix((x, y, z), (qw, qx, qy, qz)))
 
 
@@ -225,8 +225,8 @@ class OrbSlam3Process:
             self._ahead, chunk = imu[later], imu[~later] * (1e-9, 1, 1, 1, 1, 1, 1)
         if depth is not None:
             # 0 is how ORB-SLAM3 knows that there is no depth.
-            known = np.where(np.isfinite(depth), depth, np.float32(0))
-            result = self._slam.track_rgbd(image, known, stamp * 1e-9, chunk)
+            finite_depth = np.where(np.isfinite(depth), depth, np.float32(0))
+            result = self._slam.track_rgbd(image, finite_depth, stamp * 1e-9, chunk)
         elif right is not None:
             result = self._slam.track_stereo(image, right, stamp * 1e-9, chunk)
         else:
@@ -292,7 +292,7 @@ class OrbSlam3Process:
                 reason = "a new map, put where the camera was last known to be"
             points = self._slam.tracked_map_points()
             if len(points) and len(corners):
-                inliers[self._corners_of(points, pose, corners)] = True
+                inliers[self._match_corners(points, pose, corners)] = True
         self._new, self._was_ok = tracked and not self._was_ok, tracked
         return OrbSlam3Result(
             pose=self._anchor.last,
@@ -318,10 +318,12 @@ class OrbSlam3Process:
                 nearest = np.abs(np.array(self._stamps) - first.stamp * 1e9).argmin()
                 self._first_keyframe = self._stamps[nearest]
 
-    def _corners_of(self, points: Points, pose: Floats, corners: Points) -> npt.NDArray[np.int64]:
+    def _match_corners(
+        self, points: Points, pose: Floats, corners: Points
+    ) -> npt.NDArray[np.int64]:
         """Return the corners matched to map points (n, 3) of ORB-SLAM3's world."""
-        seen = (points - pose[:3, 3]) @ pose[:3, :3]
-        ahead = seen[seen[:, 2] > 0]
+        in_camera = (points - pose[:3, 3]) @ pose[:3, :3]
+        ahead = in_camera[in_camera[:, 2] > 0]
         fx, fy, cx, cy = self._settings.intrinsics
         pixels = ahead[:, :2] / ahead[:, 2:] * (fx, fy) + (cx, cy)
         distance, corner = KDTree(corners).query(pixels)
@@ -356,11 +358,11 @@ def wait_for_other_threads(until: float) -> None:
     """Return when the other threads, polling every 3 and 5 ms, rest, or at a `process_time`."""
     quiet, naps = 0, _naps()
     while quiet < 3 and time.process_time() < until:
-        begin = time.process_time() - time.thread_time()  # of the others
+        start = time.process_time() - time.thread_time()  # of the others
         time.sleep(_QUIET)
         before, naps = naps, _naps()
         # Who computes, or runs (or waits for a processor) without a nap, has something to do.
-        busy = time.process_time() - time.thread_time() - begin > _QUIET / 5
+        busy = time.process_time() - time.thread_time() - start > _QUIET / 5
         busy |= any(runs and before.get(task) == (runs, n) for task, (runs, n) in naps.items())
         quiet = 0 if busy else quiet + 1
 
@@ -491,15 +493,15 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
         """Track each image; images arriving meanwhile are skipped."""
         initialized = False
         async for frame in self.frames:
-            given = frame._asdict()
+            images = frame._asdict()
             image = frame[0]
             result = await self._slam.call(
                 OrbSlam3Process.track,
                 self.exposed_at(image),
                 image.data,
-                given["depth"].data if "depth" in given else None,
-                given["right"].data if "right" in given else None,
-                sample_rows(given["imu"]) if "imu" in given else None,
+                images["depth"].data if "depth" in images else None,
+                images["right"].data if "right" in images else None,
+                sample_rows(images["imu"]) if "imu" in images else None,
             )
             initialized = initialized or not result.lost
             if initialized:

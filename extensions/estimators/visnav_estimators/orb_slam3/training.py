@@ -52,9 +52,9 @@ class VocabularyTrainer(Node[VocabularyTrainerConfig]):
 
     async def run(self) -> None:
         """Describe every `image_interval`-th image."""
-        seen: dict[str, int] = {}
+        counts: dict[str, int] = {}
         async for image in self.images:
-            count = seen[image.source] = seen.get(image.source, -1) + 1
+            count = counts[image.source] = counts.get(image.source, -1) + 1
             if count % self.config.image_interval == 0:
                 descriptors = await self.offload(describe, image.data, self.config.features)
                 self._descriptors.append(descriptors)
