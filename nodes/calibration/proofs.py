@@ -38,7 +38,7 @@ class Figure(msgspec.Struct, frozen=True):
 
     @property
     def passed(self) -> bool:
-        """Whether the value is within its limit; false for NaN."""
+        """Return whether the value is within its limit; false for NaN."""
         return self.limit is None or self.value <= self.limit
 
 

@@ -220,8 +220,8 @@ def _inputs(cls: type[Node[Any]], docs: dict[str, str]) -> Iterator[PortDescript
 def _delivery(bound: int, overflow: str, keep: str) -> str:
     if keep == "latest":
         return "only the newest is kept"
-    beyond = {"error": "more is an error", "drop_oldest": "the oldest goes", "wait": "senders wait"}
-    return f"up to {bound:,} wait; {beyond[overflow]}"
+    effect = {"error": "more is an error", "drop_oldest": "the oldest goes", "wait": "senders wait"}
+    return f"up to {bound:,} wait; {effect[overflow]}"
 
 
 def _default(field: Any) -> str:
@@ -336,21 +336,21 @@ _BOUNDS = {
 """Bounds of msgspec's, in words and in a schema."""
 
 
-def _bounds(info: types.Type, of: str, unit: str) -> tuple[list[str], Schema]:
+def _bounds(info: types.Type, noun: str, unit: str) -> tuple[list[str], Schema]:
     """Return the bounds of a type in words and in a schema, for lengths with what they count."""
-    words: list[str] = []
+    texts: list[str] = []
     bounds: Schema = {}
     for name, (sign, key) in _BOUNDS.items():
         value = getattr(info, name, None)
         if value is None:
             continue
         if name.endswith("_length"):
-            words.append(f"{sign} {value} {unit}")
-            bounds[key + of] = value
+            texts.append(f"{sign} {value} {unit}")
+            bounds[key + noun] = value
         else:
-            words.append(f"{sign} {value}" if name == "pattern" else f"{sign} {value:g}")
+            texts.append(f"{sign} {value}" if name == "pattern" else f"{sign} {value:g}")
             bounds[key] = value
-    return words, bounds
+    return texts, bounds
 
 
 _NAME = {"type": "string", "pattern": r"^[A-Za-z_][\w-]*$", "not": {"enum": ["run", "network"]}}
@@ -412,7 +412,7 @@ class _Maker:
     def node(self, name: str, cls: type[Node[Any]]) -> str:
         """Define the table of a node; return the name of the definition."""
         key = name.replace(":", ".")
-        own = self._properties(cls.config_type)
+        settings = self._properties(cls.config_type)
         ports = [*cls.declared.listening, *cls.declared.bundle_fields()]
         link = self.struct(LinkConfig)
         head = _schema_head()
@@ -429,10 +429,10 @@ class _Maker:
             "additionalProperties": False,
         }
         self.definitions[key] = {
-            **own,
+            **settings,
             "description": summary(cls),
-            "properties": {**head, **own["properties"]},
-            "required": ["name", "type", *own.get("required", [])],
+            "properties": {**head, **settings["properties"]},
+            "required": ["name", "type", *settings.get("required", [])],
         }
         return key
 

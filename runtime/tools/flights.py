@@ -65,8 +65,8 @@ _DONE: concurrent.futures.Future[None] = concurrent.futures.Future()
 _DONE.set_result(None)
 
 
-class Kept(NamedTuple):
-    """A kept flight: its file, size (bytes), and time of last use (s)."""
+class StoredFlight(NamedTuple):
+    """A stored flight: its file, size (bytes), and time of last use (s)."""
 
     path: Path
     size: int
@@ -108,17 +108,17 @@ def home() -> Path:
     return Path(base) / "visnav-runtime" / "flights"
 
 
-def kept() -> list[Kept]:
-    """Return the kept flights, the last used first."""
+def stored() -> list[StoredFlight]:
+    """Return the stored flights, the last used first."""
     flights = []
     for path in home().glob("[!.]*.flight"):
         with contextlib.suppress(OSError):  # removed meanwhile
             if path.is_file():
-                flights.append(Kept(path, path.stat().st_size, path.stat().st_mtime))
+                flights.append(StoredFlight(path, path.stat().st_size, path.stat().st_mtime))
     return sorted(flights, key=lambda flight: -flight.used)
 
 
-def remove_beyond(gigabytes: float) -> list[Kept]:
+def remove_beyond(gigabytes: float) -> list[StoredFlight]:
     """Remove the least recently used flights beyond `gigabytes`, and return them.
 
     What a run has open stays there for it. One that is being flown just now is left alone.
@@ -127,7 +127,7 @@ def remove_beyond(gigabytes: float) -> list[Kept]:
         if unfinished.is_file():
             _remove(unfinished, unfinished.with_name(unfinished.stem[1:]))
     sizes = 0
-    removable = [flight for flight in kept() if (sizes := sizes + flight.size) > gigabytes * 1e9]
+    removable = [flight for flight in stored() if (sizes := sizes + flight.size) > gigabytes * 1e9]
     return [flight for flight in removable if _remove(flight.path, flight.path)]
 
 

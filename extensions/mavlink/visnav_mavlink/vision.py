@@ -39,8 +39,8 @@ class RefusedPoseError(ValueError):
         reason: In a word or two, by which such poses are counted.
     """
 
-    def __init__(self, reason: str, words: str) -> None:
-        super().__init__(words)
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
         self.reason = reason
 
 

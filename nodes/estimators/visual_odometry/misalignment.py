@@ -23,7 +23,7 @@ from nodes.estimators.visual_odometry.landmarks import Landmarks, MapMatch
 _TERMS = 6
 _DEVIATIONS = np.array([1.0, 0.7, 0.7, 0.4, 0.4, 0.4])  # of the coefficients beforehand, pixels
 _HUBER = 2.0
-_FEW = 10  # least number of a key frame's landmarks in an image that tell of the disparities
+_FEW = 10  # least number of a key frame's landmarks in an image for an update of the disparities
 _ALIKE = 0.1  # weight of a landmark: errors of matching are alike in all images
 _ROW_NOISE = 0.2  # standard deviation of a row, pixels
 _PIXEL_NOISE = 0.5  # standard deviation of a landmark's pixel, errors of its place included

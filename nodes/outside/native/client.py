@@ -201,7 +201,7 @@ class Link:
         return dict(json.loads(body[GREETING.size + MEMORY.size :]))
 
     def ready(self, pose_of: str = "camera") -> None:
-        """Tell the run to begin, and whose poses come: of the optical camera 0, or the body."""
+        """Send READY, and whose poses will be sent: of the optical camera 0, or the body."""
         self._send(READY, struct.pack("<II", POSE_OF[pose_of], 0))
 
     def __iter__(self) -> Iterator[Frame]:
@@ -230,8 +230,8 @@ class Link:
         try:
             return self._frame(body) if kind == FRAME else self._input(body)
         except (struct.error, ValueError, IndexError) as error:
-            what = "a frame" if kind == FRAME else "an input"
-            raise ProtocolError(f"expected {what}, found {error}") from None
+            expected = "a frame" if kind == FRAME else "an input"
+            raise ProtocolError(f"expected {expected}, found {error}") from None
 
     def _input(self, body: bytearray) -> LinkInput:
         number, count, arrived = INPUT_HEAD.unpack_from(body)
@@ -339,7 +339,7 @@ class Link:
         self._send(LOG, text.encode())
 
     def close(self, reason: str = "") -> None:
-        """Say goodbye and close; arrays of frames stay readable."""
+        """Send BYE and close; arrays of frames stay readable."""
         self._send(BYE, reason.encode())
         self._socket.close()
 

@@ -260,7 +260,7 @@ class Endpoint:
                 self._changed.notify_all()
 
     def close(self) -> None:
-        """Say BYE, disconnect, and remove the socket; takes two seconds at most."""
+        """Send BYE, disconnect, and remove the socket; takes two seconds at most."""
         with self._changed:
             closed, self._closed = self._closed, True
             self._changed.notify_all()

@@ -41,7 +41,7 @@ def main(control: socket.socket, grace: float, command: list[str]) -> None:
     ends.register(os.pidfd_open(program), select.POLLIN)
     ends.register(control, select.POLLIN)
     ends.poll()
-    try:  # its number is still its own: nobody has waited for it
+    try:  # its number is not reused yet, as it was not waited for
         os.killpg(program, signal.SIGTERM)
     except OSError:  # it has gone into another group
         os.kill(program, signal.SIGTERM)

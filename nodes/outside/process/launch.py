@@ -137,7 +137,7 @@ class ProgramError(VisnavError):
 
 
 class Launch:
-    """How a program is started.
+    """Start of a program: its folder, environment and files.
 
     Args:
         bridge: Settings of the bridge that feeds it, if one does.

@@ -401,7 +401,7 @@ class Process(Estimator[ProcessConfig]):
         self._show.end()
         self._launch.close()
 
-    # What is known of the program, in any thread.
+    # State of the program, in any thread.
 
     def _processes(self) -> list[int]:
         return [] if self._program is None else self._program.processes()
@@ -439,7 +439,7 @@ class Process(Estimator[ProcessConfig]):
         self._program.wait(_STORY)
         return f"{reason}; {self.config.command[0]} {self._program.story()}"
 
-    # What was announced.
+    # Announced sensors.
 
     def _choose_inputs(self) -> Iterable[str]:
         """Choose the sensors, and yield an error for each that is missing."""

@@ -137,11 +137,11 @@ def cloud(
         )
     )
     dense = frame.pop()  # follows the data
-    begin, size = len(frame), count * kind.itemsize
-    _LENGTH.pack_into(frame, begin - 4, size)
+    start, size = len(frame), count * kind.itemsize
+    _LENGTH.pack_into(frame, start - 4, size)
     frame += bytearray(size + 1)
     frame[-1] = dense
-    rows = np.frombuffer(frame, kind, count, begin)
+    rows = np.frombuffer(frame, kind, count, start)
     rows["xyz"] = points
     return frame, rows
 
@@ -242,9 +242,9 @@ def inverse_depth(
     most = np.float32(farthest)
     a = np.float32(quantization * (quantization + 1.0))
     b = np.float32(1.0) - a / most
-    known = (depth > 0.0) & (depth < most)
-    steps = np.minimum(np.rint(a / np.where(known, depth, most) + b), 65535.0)
-    return HEAD.pack(0, a, b) + encode_depth(np.where(known, steps, 0.0).astype(np.uint16))
+    valid = (depth > 0.0) & (depth < most)
+    steps = np.minimum(np.rint(a / np.where(valid, depth, most) + b), 65535.0)
+    return HEAD.pack(0, a, b) + encode_depth(np.where(valid, steps, 0.0).astype(np.uint16))
 
 
 def depth_in_millimetres(depth: npt.NDArray[np.float32]) -> bytes:
@@ -267,11 +267,11 @@ def _decoded_depth(code: npt.NDArray[np.uint8], format_: str) -> npt.NDArray[np.
     if steps.dtype != np.uint16 or steps.ndim != 2:
         raise ValueError(f"expected depth in 16 bits, found {steps.dtype} {steps.shape}")
     metres = np.full(steps.shape, np.inf, np.float32)
-    known = steps > 0
+    valid = steps > 0
     if format_.startswith("16UC1"):
-        metres[known] = steps[known] * np.float32(0.001)
+        metres[valid] = steps[valid] * np.float32(0.001)
     elif format_.startswith("32FC1"):
-        metres[known] = np.float32(a) / (steps[known] - np.float32(b))
+        metres[valid] = np.float32(a) / (steps[valid] - np.float32(b))
     else:
         raise ValueError(f"expected depth of 16UC1 or 32FC1, found {format_!r:.80}")
     return metres

@@ -242,7 +242,7 @@ def true_pose(message: Any, context: MessageContext) -> Event:
         frame_id=frame_id,
         position=place,
         orientation=orientation,
-        linear_velocity=(0.0, 0.0, 0.0),  # nobody says
+        linear_velocity=(0.0, 0.0, 0.0),  # unknown
         angular_velocity=(0.0, 0.0, 0.0),
     )
 
@@ -275,7 +275,7 @@ def camera_announcement(
         source=source,
         images=images,
         info=info,
-        rate=30.0,  # nobody says
+        rate=30.0,  # unknown
         latency=0.0,
         baseline=abs(float(message.p[3])) / info.fx,
         frame_id=frame_id or message.header.frame_id,

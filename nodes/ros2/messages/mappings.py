@@ -105,7 +105,7 @@ class Mapping(msgspec.Struct, frozen=True):
     image: bool = False  # whether an estimator may subscribe to it for its images
     # Returns the text for `{}`; `None` for an event without such a message.
     source: Callable[[Outgoing, Any], str | None] = _source
-    # Whether settings let it be published, beside `group`.
+    # Whether settings allow its publication, beside `group`.
     wanted: Callable[[PublishingConfig], object] = _always
     use: str = ""  # use of the messages, as settings name it
     read: Reader = incoming.nothing
@@ -144,7 +144,7 @@ _OWN = (
             large=True),
     Mapping("lidar", "{}/points", _POINTS, "lidar_scans", (LidarScan,), outgoing.lidar,
             (LidarAnnouncement,), qos=_SENSOR, large=True, image=True),
-    # Where bodies are, are thought to be, and are to go.
+    # True, estimated and planned poses.
     Mapping("odometry", "{}/odom", _ODOMETRY, "odometry", (Odometry,), outgoing.odometry,
             (VehicleAnnouncement,), use="odometry", read=incoming.odometry),
     Mapping("pose", "{}/pose", _POSE, "camera_poses", (PoseStamped,), outgoing.pose,
@@ -183,7 +183,7 @@ _OWN = (
             use="velocity", read=incoming.stamped_velocity),
     Mapping(type=_POSE, becomes=PositionSetpoint, use="position", read=incoming.position),
     Mapping(type=_POSE, becomes=PoseSetpoint, use="pose", read=incoming.pose),
-    # What small sensors measure.
+    # Measurements of small sensors.
     Mapping("imu", "{}/imu", "sensor_msgs/msg/Imu", "imu", (Imu,), outgoing.imu,
             (ImuAnnouncement,), qos=_SENSOR, use="imu", read=incoming.imu),
     Mapping("range", "{}/range", "sensor_msgs/msg/Range", "ranges", (Range,), outgoing.distance,
@@ -277,7 +277,7 @@ LARGE: tuple[type[Event], ...] = tuple(
 
 SMALL: tuple[type[Event], ...] = (
     *dict.fromkeys(event for row in PUBLISHED if not row.large for event in row.events),
-    TrackedFeatures,  # no message: it tells whose estimates an estimator's are
+    TrackedFeatures,  # no message: it determines the vehicle of an estimator
 )  # all other events with messages, and events with an effect on messages
 
 

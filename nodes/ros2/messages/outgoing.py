@@ -121,8 +121,8 @@ class Outgoing:
 
     def twist(self, linear: Vector3, angular: Vector3) -> Any:
         """Return a ``geometry_msgs/msg/Twist`` of vectors in ROS's axes."""
-        made = self.xyz(linear), self.xyz(angular)
-        return self.make("geometry_msgs/msg/Twist", linear=made[0], angular=made[1])
+        vectors = self.xyz(linear), self.xyz(angular)
+        return self.make("geometry_msgs/msg/Twist", linear=vectors[0], angular=vectors[1])
 
     def with_covariance(self, part: str, value: Any, covariance: Any = _ZEROS_36) -> Any:
         """Return a ``PoseWithCovariance`` or ``TwistWithCovariance``; zeros: nothing is known."""
@@ -158,7 +158,7 @@ def camera_info(out: Outgoing, event: Image | DepthImage) -> Any:
     """Return a sensor_msgs/CameraInfo: K, D, R (identity) and P, with a stereo baseline."""
     camera = out.cameras[event.source]
     info = camera.info
-    none = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
+    no_region = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
     # K, and of a stereo rig's right camera -fx times its baseline.
     projection = np.column_stack([info.matrix(), [0.0 - info.fx * camera.baseline, 0.0, 0.0]])
     return out.make(
@@ -173,7 +173,7 @@ def camera_info(out: Outgoing, event: Image | DepthImage) -> Any:
         p=projection.ravel(),
         binning_x=0,
         binning_y=0,
-        roi=out.make("sensor_msgs/msg/RegionOfInterest", **none),
+        roi=out.make("sensor_msgs/msg/RegionOfInterest", **no_region),
     )
 
 
@@ -226,7 +226,7 @@ def lidar(out: Outgoing, event: LidarScan) -> bytearray:
     return message
 
 
-# What is small.
+# Small messages.
 
 
 def odometry(out: Outgoing, event: Odometry) -> Any:
@@ -247,14 +247,14 @@ def pose(out: Outgoing, event: PoseStamped) -> Any:
     """Return a geometry_msgs/PoseStamped of a camera's optical frame, or of a body."""
     camera = out.cameras.get(event.source)
     axes: Axes = "body" if camera is None else out.names.axes(camera.frame_id)
-    made = out.pose(event, axes)
-    return out.make("geometry_msgs/msg/PoseStamped", header=out.header(event), pose=made)
+    pose_message = out.pose(event, axes)
+    return out.make("geometry_msgs/msg/PoseStamped", header=out.header(event), pose=pose_message)
 
 
 def estimate(out: Outgoing, event: PoseEstimate) -> Any:
     """Return a geometry_msgs/PoseStamped."""
-    made = out.pose(event, out.names.axes(event.child_frame_id))
-    return out.make("geometry_msgs/msg/PoseStamped", header=out.header(event), pose=made)
+    pose_message = out.pose(event, out.names.axes(event.child_frame_id))
+    return out.make("geometry_msgs/msg/PoseStamped", header=out.header(event), pose=pose_message)
 
 
 def estimate_with_covariance(out: Outgoing, event: PoseEstimate) -> Any:
@@ -263,11 +263,11 @@ def estimate_with_covariance(out: Outgoing, event: PoseEstimate) -> Any:
     if event.covariance:
         axes = out.names.axes(event.frame_id)
         covariance = convert_covariance(axes, np.array(event.covariance))
-    made = out.pose(event, out.names.axes(event.child_frame_id))
+    pose_message = out.pose(event, out.names.axes(event.child_frame_id))
     return out.make(
         "geometry_msgs/msg/PoseWithCovarianceStamped",
         header=out.header(event),
-        pose=out.with_covariance("pose", made, covariance),
+        pose=out.with_covariance("pose", pose_message, covariance),
     )
 
 

@@ -79,7 +79,7 @@ def program() -> None:
         if "zenoh" not in sys.modules or not isinstance(end.code, int | None):
             raise
         atexit._run_exitfuncs()
-        with contextlib.suppress(OSError, ValueError):  # nobody reads it any more
+        with contextlib.suppress(OSError, ValueError):  # a closed pipe
             sys.stdout.flush()
             sys.stderr.flush()
         os._exit(end.code or 0)

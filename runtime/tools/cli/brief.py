@@ -63,7 +63,7 @@ def show(
 
 
 class _Results(msgspec.Struct):
-    """Of a run, or of a judgement."""
+    """Results of a run, or of a judgement."""
 
     verdict: Verdict | None = None
     error: str | None = None
@@ -149,27 +149,29 @@ def print_failures(summary: Summary) -> None:
     print_words(_failures(summary))
 
 
-def print_words(shown: Iterable[str], console: Console | None = None) -> None:
+def print_words(texts: Iterable[str], console: Console | None = None) -> None:
     """Print lines with rich's markup: of a terminal wrapped between words, else as they are."""
     console = console or Console()
-    for line in shown:
+    for line in texts:
         console.print(line, highlight=False, soft_wrap=not console.is_terminal)
 
 
 def lines(summary: Summary, folder: Path) -> Iterator[str]:
     """Return the lines, with rich's markup."""
     yield from _failures(summary)
-    took = ""
+    pace = ""
     if summary.clock == "lockstep":
         speed = summary.sim_seconds / max(summary.wall_seconds, 1e-9)
-        took = f" in {summary.wall_seconds:.1f} s ({speed:.1f} × real time)"
+        pace = f" in {summary.wall_seconds:.1f} s ({speed:.1f} × real time)"
     yield (
         f"[bold]{escape(summary.name)}[/bold]: {summary.sim_seconds:.1f} s on the {summary.clock} "
-        f"clock, seed {summary.seed},{took or ' in real time'}, ended by: {escape(summary.reason)}"
+        f"clock, seed {summary.seed},{pace or ' in real time'}, ended by: {escape(summary.reason)}"
     )
     if (twice := summary.twice) is not None:
-        words = "[green]repeats[/green]" if twice.repeats else f"[red]differs[/red]: {twice.first}"
-        yield f"run twice, it {words}"
+        outcome = (
+            "[green]repeats[/green]" if twice.repeats else f"[red]differs[/red]: {twice.first}"
+        )
+        yield f"run twice, it {outcome}"
     if summary.not_deterministic:
         yield f"repeating it is not promised, because of {', '.join(summary.not_deterministic)}"
     estimators = summary.verdict.estimators if summary.verdict else {}
@@ -180,20 +182,22 @@ def lines(summary: Summary, folder: Path) -> Iterator[str]:
     for vehicle, figures in (summary.verdict.flights if summary.verdict else {}).items():
         yield from _flight(vehicle, figures)
     judged = {name.partition("/")[0] for name in estimators}
-    others = {k: s.dropped for k, s in summary.streams.items() if k.partition(".")[0] not in judged}
-    if dropped := [f"{port} {count}" for port, count in others.items() if count]:
+    by_port = {
+        k: s.dropped for k, s in summary.streams.items() if k.partition(".")[0] not in judged
+    }
+    if dropped := [f"{port} {count}" for port, count in by_port.items() if count]:
         yield f"inputs dropped by others: {', '.join(dropped)}"
     program = "visnav" if Path(sys.argv[0]).name == "visnav" else "python -m runtime"
     page = folder / "report.html"
-    left = f"report {page}" if page.is_file() else f"results in {folder}"
-    yield f"{escape(left)}   all figures: {program} show {escape(str(folder))}"
+    location = f"report {page}" if page.is_file() else f"results in {folder}"
+    yield f"{escape(location)}   all figures: {program} show {escape(str(folder))}"
 
 
 def _heading(name: str, figures: Mapping[str, Any]) -> str:
-    why = ""
+    reason = ""
     if figures["passed"] is None:
-        why = f": {escape(str(figures.get('why') or 'no thresholds were given'))}"
-    return f"[bold]{escape(name)}[/bold] {_WORDS[figures['passed']]}{why}"
+        reason = f": {escape(str(figures.get('why') or 'no thresholds were given'))}"
+    return f"[bold]{escape(name)}[/bold] {_WORDS[figures['passed']]}{reason}"
 
 
 def _failures(summary: Summary) -> Iterator[str]:
@@ -210,32 +214,32 @@ def _failures(summary: Summary) -> Iterator[str]:
 
 
 def _flight(vehicle: str, figures: Mapping[str, Any]) -> Iterator[str]:
-    shown = []
+    parts = []
     if figures.get("collisions"):
-        shown.append(f"{figures['collisions']} collisions")
+        parts.append(f"{figures['collisions']} collisions")
     if figures.get("plan_rmse_m") is not None:
-        shown.append(f"{significant(figures['plan_rmse_m'], 3)} m from its plan, RMS")
-    if shown or figures["passed"] is not None:
+        parts.append(f"{significant(figures['plan_rmse_m'], 3)} m from its plan, RMS")
+    if parts or figures["passed"] is not None:
         state = "" if figures["passed"] is None else f" {_WORDS[figures['passed']]}"
-        yield f"[bold]flight of {escape(vehicle)}[/bold]{state}   {', '.join(shown)}".rstrip()
+        yield f"[bold]flight of {escape(vehicle)}[/bold]{state}   {', '.join(parts)}".rstrip()
 
 
 def _figures(figures: Mapping[str, Any]) -> Iterator[str]:
     if figures.get("ate_rmse_m") is None:
         return
-    shown = [f"ATE {significant(figures['ate_rmse_m'], 3)} m"]
+    parts = [f"ATE {significant(figures['ate_rmse_m'], 3)} m"]
     if figures.get("ate_percent") is not None:
-        shown[0] += f" ({significant(figures['ate_percent'], 2)} %)"
+        parts[0] += f" ({significant(figures['ate_percent'], 2)} %)"
     for name, text, digits in (
         ("ate_max_m", "max {} m", 3),
         ("rot_rmse_deg", "rotation {}°", 2),
         ("rpe_1m_trans_percent", "RPE(1 m) {} %", 2),
     ):
         if figures.get(name) is not None:
-            shown.append(text.format(significant(figures[name], digits)))
+            parts.append(text.format(significant(figures[name], digits)))
     if figures.get("lost_count") and figures.get("flight_ate_percent") is not None:
-        shown.append(f"with lost time {significant(figures['flight_ate_percent'], 2)} %")
-    yield f"{', '.join(shown)}   alignment: {figures.get('alignment', 'none')}"
+        parts.append(f"with lost time {significant(figures['flight_ate_percent'], 2)} %")
+    yield f"{', '.join(parts)}   alignment: {figures.get('alignment', 'none')}"
 
 
 def _flow(name: str, figures: Mapping[str, Any], summary: Summary) -> Iterator[str]:

@@ -192,7 +192,7 @@ def carry_out(
 
 @contextlib.contextmanager
 def _signals_interrupt(children: Children) -> Iterator[None]:
-    """Let Ctrl-C, SIGTERM and a closed terminal end the runs, and the sweep; unless ignored."""
+    """Make Ctrl-C, SIGTERM and a closed terminal end the runs, and the sweep; unless ignored."""
 
     def stop(*_: object) -> None:
         first = not children.ending
@@ -231,13 +231,13 @@ def flights(
     20 GB, or as many as VISNAV_FLIGHTS_GB says. What a flight depends on is a part of its name, so
     one that no longer fits is not used, and goes when it was not used for longest.
     """
-    from runtime.tools.flights import home, kept, remove_beyond
+    from runtime.tools.flights import home, remove_beyond, stored
 
     if clear or keep is not None:
         removed = remove_beyond(0.0 if clear or keep is None else keep)
         gigabytes = sum(flight.size for flight in removed) / 1e9
         print(f"{len(removed)} flights removed, {gigabytes:.2f} GB")
-    cached = kept()
+    cached = stored()
     for flight in cached:
         used = datetime.fromtimestamp(flight.used).strftime("%Y-%m-%d %H:%M")
         print(f"{flight.path.stem}  {flight.size / 1e9:7.2f} GB  used {used}")

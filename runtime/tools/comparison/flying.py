@@ -306,7 +306,7 @@ def write_page(
 
 
 class Slopes(msgspec.Struct, frozen=True):
-    """What is drawn of a `Comparison`: JSON has no infinity, which a change may be."""
+    """Drawn part of a `Comparison`: JSON has no infinity, which a change may be."""
 
     estimator: str
     figure: str

@@ -1,6 +1,6 @@
-"""What is measured in a run: estimators and their errors, paths, and images with features.
+"""Measurements of a run: estimators and their errors, paths, and images with features.
 
-Taken from the events that pass while somebody watches; errors are those that a node sends as
+Made from the events that pass while a client is connected; errors are those that a node sends as
 `Score`, and nothing is judged here.
 """
 

@@ -105,7 +105,7 @@ class Meter(Instrument):
         self._inner = 0  # nanoseconds taken by the steps nested in the running step
         self.event_sent = self._tap
 
-    def take(self) -> Mapping[str, Amount]:
+    def pop_amounts(self) -> Mapping[str, Amount]:
         """Return the sums, and start again from zero.
 
         They are the time of the loop of each node, without nested calls of others, and the times
@@ -200,7 +200,7 @@ class Observer:
 
     # Snapshots.
 
-    def take(self) -> protocol.Snapshot:
+    def snapshot(self) -> protocol.Snapshot:
         """Return a snapshot of now and of the last second or so."""
         sample = self._sample()
         self._recent.add(sample)
@@ -229,7 +229,7 @@ class Observer:
 
     def _sample(self) -> Sample:
         _, sent = count_events(self._state)
-        return Sample(time.perf_counter(), self._state.clock.now(), sent, self._meter.take())
+        return Sample(time.perf_counter(), self._state.clock.now(), sent, self._meter.pop_amounts())
 
     def _tables(self, sample: Sample) -> dict[str, protocol.Rows]:
         state, runners = self._state, self._state.runners
@@ -345,5 +345,5 @@ class Observer:
 
 def describe(command: protocol.Command) -> str:
     """Return a command as text, for the log."""
-    words = [str(v) for v in msgspec.structs.astuple(command) if v is not None]
-    return " ".join([type(command).__name__.lower(), *words])
+    texts = [str(v) for v in msgspec.structs.astuple(command) if v is not None]
+    return " ".join([type(command).__name__.lower(), *texts])

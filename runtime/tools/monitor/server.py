@@ -89,7 +89,7 @@ class Server:
         """Send the last snapshot to all who watch, and stop listening; called on the run's loop."""
         try:
             if self._watching:
-                self._last = protocol.encode(self._observer.take()) + b"\n"
+                self._last = protocol.encode(self._observer.snapshot()) + b"\n"
             self._observer.end()
         except Exception:  # a monitor must not spoil a run's end
             log.exception("the monitor failed")
@@ -158,7 +158,7 @@ class Server:
 
     def _snapshot(self) -> bytes:
         try:
-            return protocol.encode(self._on_run_loop(self._observer.take)) + b"\n"
+            return protocol.encode(self._on_run_loop(self._observer.snapshot)) + b"\n"
         except CancelledError:
             raise
         except Exception:
@@ -222,7 +222,7 @@ def small_jpeg(data: npt.NDArray[np.uint8], features: Sequence[TrackedFeatures] 
     Pixels have the shape (height, width, 3) in RGB, or (height, width) in grey. Of its features,
     inliers are green, all others red.
     """
-    import cv2  # not before somebody asks for an image
+    import cv2  # at the first request of an image
 
     pixels: Any = data
     height, width = data.shape[:2]

@@ -240,8 +240,8 @@ def _inputs(config: Config, entries: Entries, *, with_inputs: bool) -> Iterator[
             seen.add(path)
             name = ""
             if with_inputs and path.exists():
-                below = path.relative_to(base).as_posix()
-                name = f"inputs/{number}-{base.name}/{below}"
+                relative = path.relative_to(base).as_posix()
+                name = f"inputs/{number}-{base.name}/{relative}"
                 for file in _files(path):
                     inside = file.relative_to(path).as_posix() if path.is_dir() else ""
                     entries[f"{name}/{inside}".removesuffix("/")] = file
@@ -264,8 +264,8 @@ def inputs_of(config: Config) -> Iterator[tuple[str, list[Path]]]:
         for text in inputs(spec.config):
             if text.startswith("/") and text not in programs:
                 path = Path(text)
-                further = included(path) if path.is_file() else []
-                yield f"{spec.name}{_place(table, text) or ''}", [path, *further]
+                included_files = included(path) if path.is_file() else []
+                yield f"{spec.name}{_place(table, text) or ''}", [path, *included_files]
         for source in sources_of(spec):
             if isinstance(source, Path):
                 yield spec.name, [source.absolute()]
@@ -356,8 +356,8 @@ def _notes(
     if outside := [file for file in files if file.sha256 and not file.archived]:
         yield f"inputs are not in it, only their hashes: {_listed(outside)}"
     for program in programs:
-        known = "only its hash" if program.sha256 else "it was not found"
-        yield f"the program of {program.node} is not in it, {known}: {program.command[0]}"
+        record = "only its hash" if program.sha256 else "it was not found"
+        yield f"the program of {program.node} is not in it, {record}: {program.command[0]}"
     if left_out:
         yield f"files of the run are not in it, only their hashes: {_listed(left_out)}"
     if not any(name.startswith("plots/") for name in entries):

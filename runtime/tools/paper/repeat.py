@@ -223,8 +223,8 @@ def compare_runs(bundle: Bundle, summary: Summary) -> Agreement:
     """Compare a repetition with the bundled run, by the digests of inputs and outputs."""
     before = bundle.summary
     if before.digest is None or summary.digest is None:
-        whose = "the bundle" if before.digest is None else "this run"
-        return Agreement(False, (f"not compared: {whose} has no digest",))
+        side = "the bundle" if before.digest is None else "this run"
+        return Agreement(False, (f"not compared: {side} has no digest",))
     inputs = _differing(before.inputs, summary.inputs)
     outputs = _differing(before.digests, summary.digests)
     outside = [
@@ -244,10 +244,11 @@ def compare_runs(bundle: Bundle, summary: Summary) -> Agreement:
     by_node: dict[str, list[str]] = {}
     for output in outputs:
         by_node.setdefault(output.partition(".")[0], []).append(output)
-    for node, own in by_node.items():
+    for node, names in by_node.items():
         kind = "the estimator" if node in before.code else "the node"
         lines.append(
-            f"outputs differ of {kind} {node} ({', '.join(own)})" + _figures(node, before, summary)
+            f"outputs differ of {kind} {node} ({', '.join(names)})"
+            + _figures(node, before, summary)
         )
     lines += [f"what the system {name} was sent or answered differs" for name in outside]
     if differs := bool(inputs or outputs or outside):
@@ -261,13 +262,13 @@ def _differing(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
 
 def _figures(node: str, before: Summary, now: Summary) -> str:
     """Return the error of an estimator in both runs, if it was judged in both."""
-    then, here = (run.verdict.estimators if run.verdict else {} for run in (before, now))
+    bundled, repeated = (run.verdict.estimators if run.verdict else {} for run in (before, now))
     texts = []
-    for name in here:
-        was, is_ = (figures.get(name, {}).get("ate_percent") for figures in (then, here))
-        if name.partition("/")[0] == node and was is not None and is_ is not None:
+    for name in repeated:
+        old, new = (figures.get(name, {}).get("ate_percent") for figures in (bundled, repeated))
+        if name.partition("/")[0] == node and old is not None and new is not None:
             texts.append(
-                f": ate_percent {significant(was, 4)} in the bundle, {significant(is_, 4)} here"
+                f": ate_percent {significant(old, 4)} in the bundle, {significant(new, 4)} here"
             )
     return "".join(texts)
 
@@ -276,8 +277,8 @@ def _reasons(bundle: Bundle, summary: Summary) -> Iterator[str]:
     """Yield what else is not the same."""
     before = bundle.summary
     if before.clock != "lockstep" or before.not_deterministic:
-        who = ", ".join(before.not_deterministic) or "its real clock"
-        yield f"the bundle does not promise that it repeats, because of {who}"
+        cause = ", ".join(before.not_deterministic) or "its real clock"
+        yield f"the bundle does not promise that it repeats, because of {cause}"
     for node in sorted(before.code.keys() & summary.code.keys()):
         if before.code[node] != summary.code[node]:
             yield f"the code of {node} is not that of the bundle"

@@ -190,14 +190,14 @@ def _figure_cell(row: Combination, name: str, best: str) -> Cell:
 def _best(rows: Sequence[Combination], name: str) -> str:
     """Return the best median as it is shown; "" if none is, or if all are the same."""
     better = figure(name).better
-    known = [row for row in rows if name in row.figures]
-    passed = [row.figures[name].median for row in known if not _failures(row)]
-    alignments = {row.alignment for row in known}
+    with_value = [row for row in rows if name in row.figures]
+    passed = [row.figures[name].median for row in with_value if not _failures(row)]
+    alignments = {row.alignment for row in with_value}
     if not better or not passed or (figure(name).after_alignment and len(alignments) > 1):
         return ""
     best = significant(min(passed) if better == "less" else max(passed), DIGITS)
-    shown = {significant(row.figures[name].median, DIGITS) for row in known}
-    return best if shown != {best} else ""
+    best_texts = {significant(row.figures[name].median, DIGITS) for row in with_value}
+    return best if best_texts != {best} else ""
 
 
 def _record(
@@ -215,9 +215,9 @@ def _record(
     for name in figures:
         spread = row.figures.get(name)
         unit = f" [{unit}]" if (unit := figure(name).unit) else ""
-        for what in ("median", "least", "most") if several else ("median",):
-            heading = f"{name} {what}{unit}" if several else f"{name}{unit}"
-            record[heading] = None if spread is None else getattr(spread, what)
+        for statistic in ("median", "least", "most") if several else ("median",):
+            heading = f"{name} {statistic}{unit}" if several else f"{name}{unit}"
+            record[heading] = None if spread is None else getattr(spread, statistic)
     return record | {"reasons": "; ".join(row.reasons)}
 
 
@@ -235,10 +235,10 @@ def comparison_table(rows: Sequence[Comparison]) -> Table:
         a, b = (
             Cell(
                 text + f" ({lost} failed)" * bool(lost),
-                best=row.verdict == word,
+                best=row.verdict == side,
                 failed=bool(lost),
             )
-            for text, lost, word in zip(texts, row.failures, ("worse", "better"), strict=True)
+            for text, lost, side in zip(texts, row.failures, ("worse", "better"), strict=True)
         )
         change, low, high = (_signed(value) for value in (row.change, row.low, row.high))
         cells.append([

@@ -92,12 +92,12 @@ def exact_p(a: Sequence[float], b: Sequence[float]) -> float | None:
 
     `None` for more than 8 values, or if all values of a side are equal.
     """
-    own, other = ranks(a), ranks(b)
-    actual = _correlation(own, other)
-    if len(own) > MOST_PERMUTED or math.isnan(actual):
+    ranks_a, ranks_b = ranks(a), ranks(b)
+    actual = _correlation(ranks_a, ranks_b)
+    if len(ranks_a) > MOST_PERMUTED or math.isnan(actual):
         return None
-    sums = other[_orders(len(own))] @ own
-    return float((sums >= float(own @ other) - 1e-9).mean())
+    sums = ranks_b[_orders(len(ranks_a))] @ ranks_a
+    return float((sums >= float(ranks_a @ ranks_b) - 1e-9).mean())
 
 
 @functools.cache
@@ -120,8 +120,10 @@ def rankings(simulated: Simulated, published: Published) -> list[Ranking]:
         real = [published[name][cell.sequence] for name in names]
         coefficient = spearman(sim, real)
         if not math.isnan(coefficient):
-            one = Ranking(cell=cell, systems=len(names), spearman=coefficient, p=exact_p(real, sim))
-            result.append(one)
+            ranking = Ranking(
+                cell=cell, systems=len(names), spearman=coefficient, p=exact_p(real, sim)
+            )
+            result.append(ranking)
     return result
 
 
@@ -183,7 +185,7 @@ def levels(simulated: Simulated, published: Published) -> dict[tuple[str, Cell],
 def failing(errors: Mapping[str, float]) -> dict[str, bool]:
     """Return in which sequences a system fails: none, or more than 5 times its own median.
 
-    Empty with fewer than three sequences, of which no median tells anything.
+    Empty with fewer than three sequences, as their median has no meaning.
     """
     if len(errors) < LEAST_SEQUENCES:
         return {}
@@ -215,8 +217,8 @@ class Failures(msgspec.Struct, frozen=True, kw_only=True):
         return _share(self.sim_only, self.sim_only + self.neither)
 
 
-def _share(part: int, whole: int) -> float:
-    return part / whole if whole else math.nan
+def _share(part: int, total: int) -> float:
+    return part / total if total else math.nan
 
 
 def failures(simulated: Simulated, published: Published) -> Failures:
@@ -225,8 +227,8 @@ def failures(simulated: Simulated, published: Published) -> Failures:
     for name, cells in simulated.items():
         real = failing(published.get(name, {}))
         for world in dict.fromkeys(cell.world for cell in cells):
-            own = {cell.sequence: error for cell, error in cells.items() if cell.world == world}
-            for sequence, failed in failing(own).items():
+            errors = {cell.sequence: error for cell, error in cells.items() if cell.world == world}
+            for sequence, failed in failing(errors).items():
                 if sequence in real:
                     counts[failed, real[sequence]] += 1
     return Failures(
@@ -345,8 +347,8 @@ def criteria(simulated: Simulated, published: Published) -> list[Criterion]:
     ]
 
 
-def _counted(part: int, whole: int) -> str:
-    return f"{part} of {whole}" if whole else ""
+def _counted(part: int, total: int) -> str:
+    return f"{part} of {total}" if total else ""
 
 
 def _verdict(right: bool, *, enough: bool = True, there: bool = True) -> Verdict:

@@ -84,8 +84,8 @@ def reality(
     from runtime.run.summarise import command_line
     from runtime.tools.cli.sweep import carry_out
 
-    whole, published = read_study(file) if file else read_study(), read_published()
-    study = whole.only(
+    full_study, published = read_study(file) if file else read_study(), read_published()
+    study = full_study.only(
         sequences=_names(sequences),
         worlds=_names(worlds),
         conditions=_names(conditions),
@@ -119,20 +119,20 @@ def reality(
         enter(*((job, rows[job.id]) for job in planned.jobs.values() if job.id in rows))
 
     enter_all()  # what ended while an earlier call was interrupted
-    left = [
+    missing = [
         job
         for run, job in planned.jobs.items()
         if not ledger.has(run, keys[run], planned.data[run[:2]], crashed=not retry)
     ]
     try:
-        if left:
-            carry_out(plan_of(left, out), jobs=jobs, finished=lambda *ended: enter(ended))
+        if missing:
+            carry_out(plan_of(missing, out), jobs=jobs, finished=lambda *ended: enter(ended))
     finally:
         enter_all()
-        everything = keys_of(whole)
-        more = keys_of(whole, seeds) if seeds else {}
-        count, old = ledger.valid(more | everything, planned.data, stale=stale)
-        write_page(whole, published, everything, count, old, page, command_line())
+        all_keys = keys_of(full_study)
+        seeded_keys = keys_of(full_study, seeds) if seeds else {}
+        count, old = ledger.valid(seeded_keys | all_keys, planned.data, stale=stale)
+        write_page(full_study, published, all_keys, count, old, page, command_line())
     typer.echo(f"{len(count)} results in {results}   the page is {page}")
 
 
@@ -156,8 +156,8 @@ def plan_lines(study: Study, planned: Planned) -> Iterator[str]:
         f"{len(planned.jobs)} runs on {planned.flights(study)} flights to do, some "
         f"{planned.hours(study):.1f} processor hours; {planned.finished} are in the ledger"
     )
-    for why, number in planned.absent.items():
-        yield f"left out: {number} runs: {why}"
+    for reason, number in planned.absent.items():
+        yield f"left out: {number} runs: {reason}"
 
 
 class Group(msgspec.Struct, frozen=True, kw_only=True):
@@ -208,8 +208,8 @@ def ablations(study: Study, count: Mapping[Run, Result]) -> dict[str, dict[str, 
     errors: dict[str, dict[str, dict[Hashable, float]]] = {}
     for run, result in count.items():
         place = run.sequence, run.world, run.seed
-        own = errors.setdefault(run.condition, {}).setdefault(run.system, {})
-        own[place] = _error(result, study)
+        by_place = errors.setdefault(run.condition, {}).setdefault(run.system, {})
+        by_place[place] = _error(result, study)
     return {
         condition.name: {
             name: f"× {ratio:.2g} ({runs})"
@@ -229,10 +229,16 @@ def differing(study: Study, count: Mapping[Run, Result]) -> list[str]:
     for run, result in count.items():
         if result.flight:
             digests.setdefault((*run[:4], systems[run.system].set), set()).add(result.flight)
-    return [" ".join(map(str, flight[:4])) for flight, own in digests.items() if len(own) > 1]
+    return [
+        " ".join(map(str, flight[:4]))
+        for flight, flight_digests in digests.items()
+        if len(flight_digests) > 1
+    ]
 
 
-def _of(errors: Mapping[str, Mapping[Cell, float]], world: str) -> dict[str, dict[Cell, float]]:
+def _in_world(
+    errors: Mapping[str, Mapping[Cell, float]], world: str
+) -> dict[str, dict[Cell, float]]:
     return {
         name: {cell: error for cell, error in row.items() if cell.world == world}
         for name, row in errors.items()
@@ -287,16 +293,16 @@ def write_page(
     worlds = [world.name for world in study.worlds]
     drawn = draw(counted, errors, labels, worlds, folder / "scatter.svg")
     flown = [w for w in worlds if any(c.world == w for row in table.values() for c in row)]
-    of_all = agreement.criteria(counted, errors)
-    of_world = [agreement.criteria(_of(counted, world), errors) for world in flown]
+    all_criteria = agreement.criteria(counted, errors)
+    criteria_by_world = [agreement.criteria(_in_world(counted, world), errors) for world in flown]
     text = template(FOLDER / "REALITY.md.jinja").render(
         command=command,
         study=study,
         finished=sum(run in count for run in keys),
         whole=len(keys),
-        criteria=of_all,
+        criteria=all_criteria,
         flown=flown,
-        by_world=[(c[0].name, c[1:]) for c in zip(of_all, *of_world, strict=True)],
+        by_world=[(c[0].name, c[1:]) for c in zip(all_criteria, *criteria_by_world, strict=True)],
         inverted=agreement.inversions(counted, errors)[0],
         rankings=agreement.rankings(counted, errors),
         levels=agreement.levels(counted, errors),

@@ -110,8 +110,8 @@ class Ledger:
         with self.path.open(encoding="utf-8", newline="") as file:
             for number, line in enumerate(csv.DictReader(file), 2):
                 try:
-                    known = {name: text for name, text in line.items() if text != ""}
-                    self._enter(msgspec.convert(known, Result, strict=False))
+                    values = {name: text for name, text in line.items() if text != ""}
+                    self._enter(msgspec.convert(values, Result, strict=False))
                 except (msgspec.MsgspecError, TypeError) as error:
                     raise ConfigError(
                         f"{self.path}: line {number}: expected a run of the study, found: {error}"

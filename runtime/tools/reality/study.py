@@ -111,12 +111,12 @@ class Study(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             CommandError: A name is unknown.
         """
         chosen = {}
-        for what, wanted in names.items():
-            known = {part.name: part for part in getattr(self, what)}
-            for name in wanted:
-                message = f"--{what}: expected some of {', '.join(known)}, found {name}"
-                expect_known(name, known, message, CommandError)
-            chosen[what] = tuple(p for n, p in known.items() if not wanted or n in wanted)
+        for field, selected in names.items():
+            by_name = {part.name: part for part in getattr(self, field)}
+            for name in selected:
+                message = f"--{field}: expected some of {', '.join(by_name)}, found {name}"
+                expect_known(name, by_name, message, CommandError)
+            chosen[field] = tuple(p for n, p in by_name.items() if not selected or n in selected)
         return msgspec.structs.replace(self, **chosen)
 
 
@@ -144,12 +144,12 @@ class Published(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         for table in self.tables:
             names = table.sequences.split()
             for row, text in table.rows.items():
-                words = text.split()
-                if len(words) != len(names):
+                columns = text.split()
+                if len(columns) != len(names):
                     raise ConfigError(
-                        f"published.toml: {row}: expected {len(names)} words, found {len(words)}"
+                        f"published.toml: {row}: expected {len(names)} words, found {len(columns)}"
                     )
-                pairs = zip(names, words, strict=True)
+                pairs = zip(names, columns, strict=True)
                 rows[row] = {n: math.inf if w == "x" else float(w) for n, w in pairs if w != "-"}
         return rows
 
@@ -191,15 +191,15 @@ def truths(folder: Path | None, sequences: Iterable[Part]) -> dict[str, Path]:
         (path for path in folder.resolve().rglob("*") if path.suffix in {".csv", ".txt", ".tum"}),
         key=lambda path: (path.suffix != ".csv", "original" in path.name, str(path)),
     )
-    own: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     for path in files:
         words = [*path.relative_to(folder.resolve()).parent.parts, path.name]
         if "mav0" in words and "state_groundtruth_estimate0" not in words:
             continue  # other sensors of a whole data set
         for part in sequences:
             if any(word.startswith(part.name) for word in words):
-                own.setdefault(part.name, path)
-    return own
+                paths.setdefault(part.name, path)
+    return paths
 
 
 class Planned(msgspec.Struct, frozen=True, kw_only=True):
@@ -306,8 +306,8 @@ def make_plan(
         override(table, f"drone.trajectory={json.dumps(str(truth[run.sequence]))}")
         if run.world in scans and outside:
             override(table, f"drone.world={json.dumps(str(outside.resolve()))}")
-        if why := fits.why_not(table, run, data[run.sequence, run.world], folder):
-            absent[why] += 1
+        if reason := fits.misfit(table, run, data[run.sequence, run.world], folder):
+            absent[reason] += 1
             continue
         settings = tuple(zip(Run._fields, map(str, run), strict=True))
         jobs[run] = make_job(parse(table, study.rig, folder), settings, run.seed, folder, out)
@@ -362,29 +362,29 @@ def key_of(table: Mapping[str, Any], folder: Path) -> str:
 
 
 class _Fits:
-    """Whether motions fit into worlds, kept in a file, since it takes 10 s to find out."""
+    """Cache, in a file, of whether motions fit into worlds: a check takes 10 s."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         try:
-            self._known: dict[str, str] = json.loads(path.read_text(encoding="utf-8"))
+            self._reasons: dict[str, str] = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError):
-            self._known = {}
+            self._reasons = {}
 
-    def why_not(self, table: Mapping[str, Any], run: Run, data: str, folder: Path) -> str:
+    def misfit(self, table: Mapping[str, Any], run: Run, data: str, folder: Path) -> str:
         """Return why a motion does not fit into a world; empty if it does."""
         (vehicle,) = (copy.deepcopy(n) for n in table["nodes"] if n["name"] == "drone")
         vehicle["cameras"] = [{**eye, "calibration_error": False} for eye in vehicle["cameras"]]
-        words = {**vehicle, "cameras": "", "trajectory": "", "imu": "", "world": run.world}
-        name = hashed([data, json.dumps(words, sort_keys=True, default=str)])
-        if name not in self._known:
-            one = {"run": table["run"], "nodes": [vehicle]}
+        reduced = {**vehicle, "cameras": "", "trajectory": "", "imu": "", "world": run.world}
+        name = hashed([data, json.dumps(reduced, sort_keys=True, default=str)])
+        if name not in self._reasons:
+            config = {"run": table["run"], "nodes": [vehicle]}
             try:
-                errors = preflight.of_nodes(parse(one, "rig.toml", folder)).errors
+                errors = preflight.of_nodes(parse(config, "rig.toml", folder)).errors
             except MotionError as error:
                 errors = [str(error)]
-            self._known[name] = errors[0] if errors else ""
+            self._reasons[name] = errors[0] if errors else ""
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            write(self._path, json.dumps(self._known, indent=1).encode())
-        why = self._known[name]
-        return f"{run.sequence} in {run.world}: {why}" if why else ""
+            write(self._path, json.dumps(self._reasons, indent=1).encode())
+        reason = self._reasons[name]
+        return f"{run.sequence} in {run.world}: {reason}" if reason else ""

@@ -120,10 +120,10 @@ def verdict(cell: Combination) -> str:
 def short(cell: Combination) -> str:
     """Return a cell of the overall table: the error, and the verdict unless all runs passed."""
     error = cell.figures.get(RANKED)
-    words = "" if error is None else f"{error.median:.3g}"
+    text = "" if error is None else f"{error.median:.3g}"
     if error is not None and f"{error.least:.3g}" != f"{error.most:.3g}":
-        words += f" ({error.least:.3g} to {error.most:.3g})"
-    return words if cell.passed == cell.runs else f"{words} {verdict(cell)}".strip()
+        text += f" ({error.least:.3g} to {error.most:.3g})"
+    return text if cell.passed == cell.runs else f"{text} {verdict(cell)}".strip()
 
 
 def cells(
@@ -163,8 +163,13 @@ def table_of(plan: Plan, rows: Sequence[Row], chosen: Sequence[str]) -> Table:
     ]
     figures = columns_of(chosen, judged)
     if not chosen:
-        known = {name for own in judged for name, value in own.items() if value is not None}
-        figures = [name for name in COLUMNS if name in known]
+        present = {
+            name
+            for figures_of_run in judged
+            for name, value in figures_of_run.items()
+            if value is not None
+        }
+        figures = [name for name in COLUMNS if name in present]
     table = [
         msgspec.structs.replace(cell, settings=(scenario,))
         for scenario, row in cells(plan, rows, figures).items()
@@ -202,12 +207,12 @@ def _times(ratios: Sequence[float]) -> str:
 
 def repeating(plan: Plan, rows: Sequence[Row]) -> dict[str, str]:
     """Return whether an estimator gave the same when run twice, in words, by its name."""
-    words = {}
+    texts = {}
     for cell in summarise(plan, rows):
         *_, name = cell.settings
         if cell.repeatable:
-            words[name] = "yes" if cell.repeatable.endswith("equal") else f"no, {cell.repeatable}"
-    return words
+            texts[name] = "yes" if cell.repeatable.endswith("equal") else f"no, {cell.repeatable}"
+    return texts
 
 
 def summaries(plan: Plan) -> Iterator[tuple[Job, dict[str, Any]]]:
@@ -246,8 +251,8 @@ def flaws(plan: Plan, rows: Sequence[Row]) -> dict[str, tuple[str, ...]]:
     for job, row in in_order(plan, rows):
         for vehicle, flight in row.get("flights", {}).items():
             for reason in flight["failed"]:
-                words = f"seed {job.seed}, {vehicle}: {reason}"
-                by_scenario.setdefault(dict(job.settings)["scenario"], {})[words] = None
+                text = f"seed {job.seed}, {vehicle}: {reason}"
+                by_scenario.setdefault(dict(job.settings)["scenario"], {})[text] = None
     return {scenario: tuple(reasons) for scenario, reasons in by_scenario.items()}
 
 
@@ -272,18 +277,18 @@ def draw(suite: Suite, cells: Mapping[str, Mapping[str, Combination]], path: Pat
     from matplotlib import colormaps
     from matplotlib.figure import Figure
 
-    there = [e.name for e in suite.estimators if any(e.name in row for row in cells.values())]
+    names = [e.name for e in suite.estimators if any(e.name in row for row in cells.values())]
     figure = Figure(figsize=(2.1 * len(suite.scenarios) + 2.4, 4.6), layout="constrained")
     axes: Any = figure.add_subplot()
     colours = colormaps["tab20"]
-    for index, name in enumerate(there):
+    for index, name in enumerate(names):
         colour = colours(index)
         for place, scenario in enumerate(suite.scenarios):
             cell = cells.get(scenario.name, {}).get(name)
             spread = cell.figures.get(RANKED) if cell else None
             if cell is None or spread is None:
                 continue
-            x = place + (index + 0.5) / len(there) * 0.8 - 0.4
+            x = place + (index + 0.5) / len(names) * 0.8 - 0.4
             axes.plot([x, x], [spread.least, spread.most], color=colour, lw=4, alpha=0.35)
             mark = "o" if cell.passed == cell.runs else "x"
             axes.plot(x, spread.median, mark, color=colour)
@@ -338,15 +343,15 @@ def write_page(suite: Suite, plan: Plan, rows: Sequence[Row], path: Path, comman
     folder = path.parent / path.stem.lower()
     folder.mkdir(parents=True, exist_ok=True)
     table = cells(plan, rows)
-    there = {name for row in table.values() for name in row}
+    names = {name for row in table.values() for name in row}
     draw(suite, table, folder / "suite.png")
     text = template(FOLDER / "SUITE.md.jinja").render(
         command=command,
         runs=len(rows),
         seeds=len({job.seed for job in plan.jobs}),
         scenarios=suite.scenarios,
-        entrants=[estimator for estimator in suite.estimators if estimator.name in there],
-        absent=[estimator for estimator in suite.estimators if estimator.name not in there],
+        entrants=[estimator for estimator in suite.estimators if estimator.name in names],
+        absent=[estimator for estimator in suite.estimators if estimator.name not in names],
         cells=table,
         verdict=verdict,
         short=short,

@@ -180,9 +180,9 @@ def _table(suite: Suite, scenario: Scenario, entrant: Entrant) -> dict[str, Any]
     return dict(unmarked(table))  # paths start at the suite's folder, not where it is called
 
 
-def _named(what: str, known: tuple[Any, ...], names: Sequence[str]) -> tuple[Any, ...]:
-    by_name = {entry.name: entry for entry in known}
+def _named(kind: str, parts: tuple[Any, ...], names: Sequence[str]) -> tuple[Any, ...]:
+    by_name = {entry.name: entry for entry in parts}
     for name in names:
-        message = f"--{what}: expected one of {', '.join(by_name)}, found {name}"
+        message = f"--{kind}: expected one of {', '.join(by_name)}, found {name}"
         expect_known(name, by_name, message, CommandError)
     return tuple(by_name[name] for name in by_name if not names or name in names)

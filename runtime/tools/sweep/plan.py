@@ -40,7 +40,7 @@ class Parameter(msgspec.Struct, frozen=True):
 
 
 class Axis(msgspec.Struct, frozen=True):
-    """Where a parameter's values lie in a plot.
+    """Positions of a parameter's values in a plot.
 
     Attributes:
         places: One for each value, in the order of the values.
@@ -183,7 +183,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """What is varied, with its values in the order of the jobs."""
+        """Varied parameters, with their values in the order of the jobs."""
         texts: dict[str, dict[str, None]] = {}
         for path, text in (setting for job in self.jobs for setting in job.settings):
             texts.setdefault(path, {})[text] = None

@@ -24,11 +24,11 @@ from runtime.tools.flights import (
     flight_of,
     fly,
     home,
-    kept,
     read_object,
     recorded,
     remove_beyond,
     settings_key,
+    stored,
     write_object,
 )
 from tests.runtime.tools.flights import samples
@@ -216,7 +216,7 @@ _OTHER_CODE = b"cevents\nNoLongerThere\n."  # a pickle that only other code can 
 def test_what_is_damaged_or_of_other_code_is_flown_again(tmp_path: Path, what: str) -> None:
     config = flown(tmp_path, "captain.end=0.2")
     recorded(config, record=True)
-    (flight,) = kept()
+    (flight,) = stored()
     content = flight.path.read_bytes()
     place = {"first": 0, "middle": len(content) // 2, "last": -1}.get(what, 0)
     changed = bytearray(content)
@@ -276,7 +276,7 @@ def test_calls_that_the_flight_does_not_know_are_an_error(tmp_path: Path) -> Non
 def test_a_flight_that_fails_is_not_kept(tmp_path: Path) -> None:
     config = flown(tmp_path, "craft.fail=true", "craft.lens=false")
     assert recorded(config, record=True) is None
-    assert kept() == []
+    assert stored() == []
     with pytest.raises(NodeError, match="out of order"):
         events_of(config)
 
@@ -286,7 +286,7 @@ def test_a_signal_during_the_flight_ends_what_was_to_follow(tmp_path: Path) -> N
     config = flown(tmp_path, "craft.signal=true", "craft.lens=false")
     with pytest.raises(KeyboardInterrupt):
         recorded(config, record=True)
-    assert kept() == []
+    assert stored() == []
 
 
 @pytest.mark.slow
@@ -319,22 +319,22 @@ def test_those_not_used_for_longest_go_first(
     configs = [flown(tmp_path, "captain.end=0.2", f"run.seed={seed}") for seed in range(3)]
     for config in configs:
         recorded(config, record=True)
-    for age, flight in enumerate(kept()):
+    for age, flight in enumerate(stored()):
         os.utime(flight.path, (1000 - age, 1000 - age))
-    newest, _, oldest = kept()
+    newest, _, oldest = stored()
     used = next(c for c in configs if content_key(flight_of(c) or c) == oldest.path.stem)
     played = recorded(used, record=False)
     (removed,) = remove_beyond((oldest.size + newest.size + 9) / 1e9)
     assert removed.path not in {oldest.path, newest.path}
-    assert [recording.path for recording in kept()] == [oldest.path, newest.path]
+    assert [recording.path for recording in stored()] == [oldest.path, newest.path]
     remove_beyond(0)
-    assert kept() == []
+    assert stored() == []
     summary, lines = events_of(used, watch=played)  # what is open stays
     assert (summary.error, len(lines) > 50) == (None, True)
     monkeypatch.setenv("VISNAV_FLIGHTS_GB", "0.000001")
     for config in configs:
         assert recorded(config, record=True)
-    assert len(kept()) == 1
+    assert len(stored()) == 1
     assert {path.suffix for path in home().iterdir()} == {".flight", ".lock"}
 
 

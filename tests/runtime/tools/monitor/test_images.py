@@ -80,17 +80,17 @@ def test_images_are_made_no_oftener_than_said(monkeypatch: pytest.MonkeyPatch) -
 def test_the_newest_image_is_known_while_somebody_looks() -> None:
     async def script(supervisor: Supervisor, observer: Observer) -> None:
         await supervisor.state.clock.sleep(0.25)
-        assert observer.take().cameras == []
+        assert observer.snapshot().cameras == []
         with pytest.raises(VisnavError, match="expected a camera that has sent images, found"):
             observer.image(CAMERA)
         observer.begin()
         for newest in (0.3, 0.4):
             await supervisor.state.clock.sleep(0.1)
-            assert observer.take().cameras == [CAMERA]
+            assert observer.snapshot().cameras == [CAMERA]
             assert observer.image(CAMERA)[0].stamp == round(newest * 1e9)
         with pytest.raises(VisnavError, match=f"did you mean {CAMERA!r}"):
             observer.image("drone.images: drone/frond")
         observer.end()
-        assert observer.take().cameras == []
+        assert observer.snapshot().cameras == []
 
     observe(script)

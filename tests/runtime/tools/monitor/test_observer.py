@@ -61,7 +61,7 @@ def test_a_snapshot_tells_what_there_was_lately() -> None:
         observer.begin()
         for _ in range(2):
             await supervisor.state.clock.sleep(0.35)
-            taken.append(observer.take())
+            taken.append(observer.snapshot())
 
     observe(script)
     first, second = taken
@@ -85,13 +85,13 @@ def test_a_snapshot_tells_what_there_was_lately() -> None:
 def test_nobody_is_measured_before_the_beginning_and_after_the_end() -> None:
     async def script(supervisor: Supervisor, observer: Observer) -> None:
         await supervisor.state.clock.sleep(0.2)
-        before = observer.take()
+        before = observer.snapshot()
         observer.begin()
         observer.begin()
         await supervisor.state.clock.sleep(0.2)
         observer.end()
         await supervisor.state.clock.sleep(0.2)
-        after = observer.take()
+        after = observer.snapshot()
         for snapshot in (before, after):
             assert row(snapshot, "nodes", "drone")["steps/s"] == "0"
             assert row(snapshot, "outputs", "drone.images")["latency ms"] == ""
@@ -104,7 +104,7 @@ def test_looking_changes_nothing_of_what_is_said() -> None:
     async def script(supervisor: Supervisor, observer: Observer) -> None:
         await supervisor.state.clock.sleep(0.25)
         observer.begin()
-        observer.take()
+        observer.snapshot()
 
     async def nothing(supervisor: Supervisor, observer: Observer) -> None:
         await supervisor.state.clock.sleep(0.25)
@@ -117,13 +117,13 @@ def test_a_node_is_restarted_once_at_a_time() -> None:
         await supervisor.state.clock.sleep(0.1)
         assert observer.execute(Restart(node="vo")) == "vo restarts"
         await supervisor.state.clock.sleep(0.1)
-        assert row(observer.take(), "nodes", "vo")["condition"].startswith("restarting")
+        assert row(observer.snapshot(), "nodes", "vo")["condition"].startswith("restarting")
         with pytest.raises(VisnavError, match="expected a node that runs, and vo is restarting"):
             observer.execute(Restart(node="vo"))
         with pytest.raises(VisnavError, match="found 'v0'"):
             observer.execute(Restart(node="v0"))
         await supervisor.state.clock.sleep(0.5)
-        assert row(observer.take(), "nodes", "vo")["condition"] == "running (1)"
+        assert row(observer.snapshot(), "nodes", "vo")["condition"] == "running (1)"
 
     observe(script)
 
@@ -134,15 +134,15 @@ def test_commands_end_the_run_and_change_settings() -> None:
         assert observer.execute(Set(text="pilot.gain=2")) == "gain = 2.0"
         assert observer.execute(Set(text="pilot.gain=2")) == "as it was"
         observer.execute(Pause())
-        paused = observer.take()
+        paused = observer.snapshot()
         assert paused.paused
         assert paused.headline.endswith("   paused")
         observer.execute(Speed(factor=0.5))
-        assert "(asked: 0.5)" in observer.take().headline
-        assert observer.take().speed == 0.5
+        assert "(asked: 0.5)" in observer.snapshot().headline
+        assert observer.snapshot().speed == 0.5
         assert observer.execute(Stop()) == "ends"
-        assert observer.take().ended == "stopped by hand"
-        assert observer.take().headline.endswith("   ends: stopped by hand")
+        assert observer.snapshot().ended == "stopped by hand"
+        assert observer.snapshot().headline.endswith("   ends: stopped by hand")
 
     assert observe(script).supervisor.state.reason == "stopped by hand"
     assert describe(Step(seconds=0.5)) == "step 0.5"
@@ -177,7 +177,7 @@ def test_real_time_takes_no_orders(command: Any) -> None:
     async def script(supervisor: Supervisor, observer: Observer) -> None:
         with pytest.raises(VisnavError, match="in real time, which cannot be stopped"):
             observer.execute(command)
-        assert "sensors do not wait" in observer.take().fixed
+        assert "sensors do not wait" in observer.snapshot().fixed
 
     observe(script, clock="real", duration=0.02)
 
@@ -241,5 +241,9 @@ def test_a_step_counts_without_those_within_it(monkeypatch: pytest.MonkeyPatch) 
         meter.wrap_call("a", "tick", work)(7)
     finally:
         loop.close()
-    assert meter.take() == {"a": Amount(2, 37, 30), "b": Amount(2, 300, 200), "c": Amount(1, 5, 5)}
-    assert meter.take() == {}
+    assert meter.pop_amounts() == {
+        "a": Amount(2, 37, 30),
+        "b": Amount(2, 300, 200),
+        "c": Amount(1, 5, 5),
+    }
+    assert meter.pop_amounts() == {}

@@ -206,15 +206,15 @@ def test_those_who_read_nothing_do_not_hold_up_the_end(
     long = LogLine(number=0, level="INFO", text="x" * 400_000)
     monkeypatch.setattr(LastRecords, "lines", lambda _: [long])
     enough = threading.Event()
-    take = Observer.take
-    taken: list[Snapshot] = []
+    snapshot = Observer.snapshot
+    snapshots: list[Snapshot] = []
 
     def counted(observer: Observer) -> Snapshot:
-        taken.append(take(observer))
+        snapshots.append(snapshot(observer))
         enough.set()
-        return taken[-1]
+        return snapshots[-1]
 
-    monkeypatch.setattr(Observer, "take", counted)
+    monkeypatch.setattr(Observer, "snapshot", counted)
     watching = [socket.socket(socket.AF_UNIX) for _ in range(8)]
 
     def outside() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from runtime.tools.flights import kept
+from runtime.tools.flights import stored
 from runtime.tools.sweep import Children, make_plan, sweep, write_tables
 from runtime.tools.sweep.process import kill_tree, last_error, read_results
 from tests.runtime.tools.flights.samples import flight_file
@@ -79,7 +79,7 @@ def test_runs_with_one_flight_fly_once_and_have_the_same_tables(
         write_tables(plan, rows)
         assert [row["error"] for row in rows] == [""] * 4
         tables.append([(plan.out / f"{t}.csv").read_bytes() for t in ("table", "summary")])
-        assert len(kept()) == (0 if fly else 2)
+        assert len(stored()) == (0 if fly else 2)
     assert tables[0] == tables[1]
 
 
