@@ -129,7 +129,7 @@ def write_files(rig: Rig, name: str, *, topics: bool = True) -> dict[str, str]:
 
 
 def left_out(rig: Rig, name: str) -> list[str]:
-    """Return what a format's files do not even say in a comment, a sentence each."""
+    """Return sentences on what a format's files leave out, even of their comments."""
     return [
         f"{camera.source}: {name} has no word for a rolling shutter ({real(camera.readout)} s)"
         for camera in rig.cameras
@@ -193,7 +193,7 @@ def _imu_errors(rig: Rig, name: str, *, ros: bool) -> dict[str, Any]:
 
 
 def _imu_remarks(imu: ImuAnnouncement) -> list[str]:
-    """Return what formats without a word for them say of the errors of scale and axes."""
+    """Return comments on errors of scale and axes, for formats that cannot express them."""
     return [
         f"{name}, which readers of this file know nothing of: {getattr(imu, name)}"
         for name in ("gyroscope_matrix", "accelerometer_matrix", "g_sensitivity")

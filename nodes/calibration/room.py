@@ -313,7 +313,7 @@ def _basalt(folder: Path) -> list[ReadCamera]:
 
 def _orbslam3(folder: Path) -> list[ReadCamera]:
     text = (folder / "orbslam3.yaml").read_text(encoding="utf-8")
-    # ORB-SLAM3 keeps matrices in single precision; what is judged is what the file says.
+    # ORB-SLAM3 reads matrices in single precision; the file's own numbers are judged.
     storage = _storage(text.replace("dt: f", "dt: d"))
     fisheye = storage.getNode("Camera.type").string() == "KannalaBrandt8"
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")

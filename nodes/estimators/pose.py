@@ -74,7 +74,7 @@ def solve_pose(
         weights = huber(errors, _HUBER) * ahead
         weighted = (by * weights[[0, 0, 1]]).reshape(6, -1)
         normal = weighted @ by.reshape(6, -1).T
-        # In units of its own, as what landmarks in one column leave open is lost in rounding else.
+        # Relative to the diagonal, else rounding hides what landmarks in one column leave open.
         normal += np.diag(_DAMPING * np.diag(normal) + _DAMPING)
         gradient = weighted @ residuals.reshape(-1)
         if information is not None:

@@ -2,25 +2,26 @@
 
 At the start announcements are exchanged, and there is one first update for all.
 
-A process is in one of these states, and says so to each other one when it comes to it:
+A process passes through these states. On entering one it sends the message on the right to all
+other processes:
 
-    meeting     knows who is there, not yet how many                    `Hello`
-    starting    all were there once, and have numbers; its nodes start  `Announcements`
-    ready       all announcements were heard; its nodes can begin       `Subscriptions`, `Ready`
-    told        knows when the first update is                          `FirstUpdate`
-    begun       the first update was                                    `Ready(begun=True)`
+    meeting     knows which processes are present, not yet all           `Hello`
+    starting    all were present once and have numbers; its nodes start  `Announcements`
+    ready       has all announcements; its nodes can begin               `Subscriptions`, `Ready`
+    scheduled   knows the time of the first update                       `FirstUpdate`
+    begun       the first update was                                     `Ready(begun=True)`
 
-The first process (or, of a run that goes on, its first process that has begun) decides: once all
-are ready, it says `FirstUpdate`. The others say it again, so that all learn of it although the
-first one is lost meanwhile. A process begins once it was told and all that are there are ready:
-then it knows what all of them want to receive.
+The first process decides; in a run that has begun already, it is the first process that has begun.
+Once all are ready, it sends `FirstUpdate`. The others send it again, so that all receive it even if
+the first process is lost meanwhile. A process begins once it has received `FirstUpdate` and all
+present processes are ready: then it has the subscriptions of all of them.
 
-Until it begins, it waits for the return of each process that is lost: for `run.startup_limit`, and
-so does whoever is still needed for the decision. Who comes back, by itself (its link had failed) or
-as a new process, begins a session, and both ends say again all that they have said. So nothing
-depends on what was lost with the session before. A new process starts its nodes anew, and must
-announce what it announced before, since processes elsewhere have heard of it. A loss after the
-decision is one of the run, also for a process that learns of it before it was told.
+Until a process begins, it waits up to `run.startup_limit` for the return of each lost process. So
+does a process that is still needed for the decision. A process returns by itself (its link had
+failed) or as a new process. Its return begins a session, and both ends send all their messages
+again. So nothing depends on what was lost with the session before. A new process starts its nodes
+again, and must announce the same as before, since other processes have received that. A loss after
+the decision is a loss during the run, also for a process that has not received `FirstUpdate` yet.
 
 At the end nodes end in reverse order of the file, wherever they are, and no process leaves before
 all summaries are exchanged. Processes that are silent for long are not waited for.
@@ -102,7 +103,7 @@ class JointStart:
     async def wait_for_first_update(self) -> Member | None:
         """Agree with the others on the first update, wait for it, and return whose clock counts.
 
-        A process that comes back to a run that goes on joins it where it is. `None` is this
+        A process that returns to a run that has begun joins it at its present time. `None` is this
         process.
         """
         membership, lockstep = self._membership, isinstance(self._clock, LockstepClock)
@@ -151,7 +152,7 @@ class JointStart:
             lambda: reference.over != "" or has_begun(),
             is_awaited=lambda m: not m.ready or m is reference,
         )
-        return has_begun()  # then the run has begun, even if the one that said so is gone since
+        return has_begun()  # true also if the sender of `FirstUpdate` was lost since
 
     def send(self, message: Message) -> None:
         """Send a message to all processes, and to those joining or returning later."""

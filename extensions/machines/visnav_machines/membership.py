@@ -1,7 +1,7 @@
 """Presence of the run's processes: meeting, joining, leaving, and waiting for them.
 
 Slow processes are named, and none is awaited for ever. Messages from Zenoh's threads are handed to
-the loop here; of the rest of this package, only handshakes and outboxes know of threads.
+the loop here; in the rest of this package, only handshakes and outboxes use threads.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ NAMED_EVERY = 5.0  # real seconds between two log lines naming the awaited proce
 
 @dataclass(eq=False)
 class Seat:
-    """Another process's part in the run, kept for whoever takes it after a loss.
+    """Another process's part in the run, kept after a loss for the process that takes it next.
 
     Attributes:
         member: The process, if present.
@@ -430,7 +430,7 @@ class Waiting:
         if limit == math.inf:
             return limit
         ends = [max([start, *(seat.first_loss for seat in self._seats)]) + limit]
-        if not any(s.member and s.member.running for s in self._seats):  # else it goes on without
+        if not any(s.member and s.member.running for s in self._seats):  # else the run continues
             ends += [s.absent.lost_at + self._startup_limit for s in self._seats if s.absent]
         return min(ends) - time.monotonic()
 

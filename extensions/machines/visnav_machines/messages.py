@@ -207,9 +207,9 @@ class StateReport(Message, frozen=True):
     """Lockstep state of the sender after a process left or joined, for a new turn.
 
     Attributes:
-        processes: Ids of all that I know to be there.
-        epoch: Of the last turn that I know of.
-        sent: How many ordered messages I have sent to each process.
+        processes: Ids of all processes that are present for the sender.
+        epoch: Of the last turn known to the sender.
+        sent: Number of ordered messages from the sender to each process.
     """
 
     processes: tuple[str, ...]

@@ -265,7 +265,7 @@ class Peers(Others):
     def joined(self, member: Member) -> None:
         """Handle a process joining or returning after the numbering of processes."""
         self._start.resend(member)
-        member.returning = self._has_begun  # until it is ready, the run goes on without it
+        member.returning = self._has_begun  # until it is ready, the run does not wait for it
 
     def now(self, ago: int = 0) -> int:
         """Return the time of the run's clock, so many real nanoseconds ago; in any thread."""

@@ -177,8 +177,8 @@ def _configuration(network: NetworkConfig) -> zenoh.Config:
         "scouting/gossip/autoconnect_strategy": {
             "peer": {"to_router": "always", "to_peer": "greater-zid"}
         },
-        # The first process on that host takes the address, and the others connect to it; each
-        # tells the rest where else it listens.
+        # The first process on that host takes the address, and the others connect to it. Each
+        # sends the others its further addresses.
         "listen/endpoints": [network.meet, *_beside(network.meet)],
         "listen/exit_on_failure": False,
         "listen/timeout_ms": 0,

@@ -4,7 +4,7 @@ Each process has a loop on simulated time. The one that has the turn runs on unt
 something due before its own next thing, or until it has sent something that others must receive
 first; then it passes the turn on, with the time, and with the counters that order what is due at
 one time. So everything happens in the order in which one process would have done it, and workers
-and threads go on beside in all processes at once.
+and threads run beside it in all processes at once.
 
 Here are no sockets: messages are sent by `send`, and passed to `receive`.
 """

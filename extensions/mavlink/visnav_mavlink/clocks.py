@@ -1,8 +1,9 @@
 """Clocks of programs outside: whether stamps are ours, and by how much others' are off.
 
-A stamp may be of our clock (which our answers to ``TIMESYNC`` tell), or of the program's own, which
-its answers to our ``TIMESYNC`` tell. What makes the first pose younger counts. If neither can be,
-the earliest arrival counts as at once, and all stamps keep their distances.
+A stamp may be of our clock, which programs know by our answers to ``TIMESYNC``, or of the
+program's clock, which we know by its answers to our ``TIMESYNC``. The clock by which the first pose
+is younger counts. If neither is possible, the earliest arrival counts as without delay, and the
+differences between stamps stay.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from visnav_mavlink.settings import MavlinkConfig
 from visnav_mavlink.vehicle import SECOND, Parameters, Telemetry, Vehicle
 from visnav_mavlink.vision import Vision
 
-MOST_SAID = 100  # sentences that the log has once each, lest messages of any kind fill it
+MOST_SAID = 100  # different sentences in the log, once each; bounds a flood of messages
 
 Handler = Callable[[Peer, Sender, Any, int], None]
 """Takes the link's peer, the sender, the message and the time (ns)."""

@@ -75,7 +75,7 @@ class McapWriter:
             self._writer = records.writer(
                 self._file,  # type: ignore[arg-type]
                 compression=compression,
-                chunk_size=1 << 62,  # ends of chunks are ours to say
+                chunk_size=1 << 62,  # chunks are ended here, not by size
                 profile="ros2",
                 library=LIBRARY,
             )

@@ -439,7 +439,7 @@ class RosBag(Reader):
             frame_id=event.frame_id,
             position=position,
             orientation=orientation,
-            gyroscope_noise_density=0.0,  # messages do not say
+            gyroscope_noise_density=0.0,  # not in messages
             gyroscope_random_walk=0.0,
             accelerometer_noise_density=0.0,
             accelerometer_random_walk=0.0,

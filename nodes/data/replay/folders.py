@@ -1,4 +1,4 @@
-"""Readers of data sets: what each of them has to say, and what all have in common."""
+"""Readers of data sets: what each of them defines, and what all have in common."""
 
 from __future__ import annotations
 

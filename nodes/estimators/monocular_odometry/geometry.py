@@ -185,7 +185,7 @@ def hypotheses(first: Floats, second: Floats, matrix: Floats) -> list[Floats]:
     A homography (corners on a plane; up to four motions: E. Malis and M. Vargas, "Deeper
     understanding of the homography decomposition", INRIA 2007) and an essential matrix (D. Nistér,
     "An efficient solution to the five-point relative pose problem", PAMI 2004) are both fitted;
-    further views tell the right one.
+    further views decide which is right.
     """
     motions: list[Floats] = []
     cv2.setRNGSeed(1)

@@ -140,8 +140,8 @@ class StereoMatcher:
             good &= self._is_distinct(pixels[rows], disparity)
             refined[rows[good]] = disparity[good]
         if len(without):
-            # Blocks match on little texture, and at no outline; flow finds any corner, and says by
-            # its neighbourhood whether that is a plane.
+            # Blocks match on little texture, but not at outlines. Flow finds any corner, and the
+            # flow of its neighbourhood shows whether that is a plane.
             centre = pixels[without]
             disparity, good = self._disparity(centre, np.zeros(len(centre)), _LEVELS)
             beside, all_good = self._disparity(
