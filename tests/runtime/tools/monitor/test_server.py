@@ -188,7 +188,7 @@ def test_a_monitor_that_fails_leaves_the_run_alone(monkeypatch: pytest.MonkeyPat
     def fail(_: Observer) -> Snapshot:
         raise RuntimeError("no image")
 
-    monkeypatch.setattr(Observer, "take", fail)
+    monkeypatch.setattr(Observer, "snapshot", fail)
 
     def outside() -> None:
         with socket.socket(socket.AF_UNIX) as connection:
