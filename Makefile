@@ -79,9 +79,9 @@ test-opencv4: $(READY) .venv-opencv4  ## Run the quick tests of what draws, sees
 
 test-all: test test-slow test-pythons test-opencv4  ## Run all tests.
 
-# MODULE=runtime.channels.hold SAMPLE=40 TESTS='tests/further ...'; see tools/mutants.py.
+# MODULE=runtime.channels.hold SAMPLE=40 TESTS='tests/further ...' or ONLY='tests/x ...'; see tools/mutants.py.
 mutants: $(READY)  ## Plant small faults in a module, MODULE=..., that its quick tests have to notice.
-	$(BIN)/python -m tools.mutants $(MODULE) --sample $(or $(SAMPLE),0) --tests $(TESTS)
+	$(BIN)/python -m tools.mutants $(MODULE) --sample $(or $(SAMPLE),0) --tests $(TESTS) $(if $(ONLY),--only $(ONLY))
 
 check: $(READY)  ## Check style and types.
 	$(BIN)/ruff check .

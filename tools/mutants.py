@@ -242,6 +242,7 @@ def main() -> None:
     parser.add_argument(
         "--tests", nargs="*", default=[], help="beside those of its folder and those listed"
     )
+    parser.add_argument("--only", nargs="+", metavar="TESTS", help="instead of all those")
     parser.add_argument("--sample", type=int, default=0, help="so many, at random; 0 for all")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
@@ -257,7 +258,7 @@ def main() -> None:
     count = len(chosen)
     if 0 < asked.sample < count:
         chosen = random.Random(asked.seed).sample(chosen, asked.sample)  # noqa: S311
-    places = [*places_of(asked.module), *asked.tests]
+    places = asked.only or [*places_of(asked.module), *asked.tests]
     results = Counter[str]()
     for mutant, result in run_mutants(asked.module, chosen, places, asked.jobs):
         results[result] += 1

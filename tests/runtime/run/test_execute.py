@@ -225,10 +225,10 @@ def test_a_stall_is_logged_as_it_happens(
     monkeypatch.setattr(execution, "LoopWatchdog", Watchdog)
     monkeypatch.setattr(Watchdog, "stops", 0)
     lines = Lines()
-    summary = fly(Ends, lines=lines, clock=clock, stall=Duration(0.25), log="debug")
+    summary = fly(Ends, lines=lines, clock=clock, stall=Duration(2.5), log="debug")
     (stall,) = [record for record in lines.records if "the loop stood" in record.getMessage()]
     assert stall.levelname == level
-    assert stall.getMessage() == "the loop stood for 250 ms: vo, vo.py:7 in track"
+    assert stall.getMessage() == "the loop stood for 2500 ms: vo, vo.py:7 in track"
     assert summary.stalls["vo"] == 1
     assert Watchdog.stops == 1
 
