@@ -51,22 +51,28 @@ OPTIONS = ("-qx", "-n0", "--assert=plain", "-pno:cacheprovider", "--timeout=0", 
 KILLED = ("killed", "timed out")
 MOST_LINES = 10_000  # of a module
 MOST_BYTES = 8 << 30  # of memory
-PATIENCE = 15  # real seconds for a test
+PATIENCE = 15  # real seconds for a test, and as often as `SLOWER` those of the slowest
+SLOWER = 3
 
 
 class Baseline(msgspec.Struct):
-    """The tests without a fault: lines of the module by test, libraries, and processor time (s)."""
+    """The tests without a fault: lines of the module by test, libraries, processor time (s).
+
+    Attributes:
+        slowest: Real seconds of the slowest test: on a busy machine others may be as slow later.
+    """
 
     tests: dict[str, set[int]] = {}
     libraries: list[str] = []
     seconds: float = 0.0
+    slowest: float = 0.0
 
 
 class Plugin:
     """Plugin of pytest that runs the chosen tests only or, without any, records a `Baseline`."""
 
-    def __init__(self, file: Path, chosen: Collection[str] = ()) -> None:
-        self.file, self.chosen = str(file), chosen
+    def __init__(self, file: Path, chosen: Collection[str] = (), patience: int = PATIENCE) -> None:
+        self.file, self.chosen, self.patience = str(file), chosen, patience
         self.baseline = Baseline()
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
@@ -74,11 +80,16 @@ class Plugin:
         if self.chosen:
             items[:] = [item for item in items if item.nodeid in self.chosen]
 
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_timeout_set_timer(self) -> bool:
+        """Replace the timer of pytest-timeout: there is but one alarm, and a test may catch its."""
+        return True
+
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, object, object]:
         """Record the lines that a test runs, in all threads."""
         if self.chosen:
-            signal.alarm(PATIENCE)  # which ends the process
+            signal.alarm(self.patience)  # which ends the process
             return (yield)
         lines = self.baseline.tests.setdefault(item.nodeid, set())
 
@@ -90,9 +101,11 @@ class Plugin:
 
         threading.settrace(trace)
         sys.settrace(trace)
+        begin = time.monotonic()
         try:
             return (yield)
         finally:
+            self.baseline.slowest = max(self.baseline.slowest, time.monotonic() - begin)
             if sys.gettrace() is None:  # Python has given up, as where the stack is full
                 lines.update(range(MOST_LINES))
             sys.settrace(None)
@@ -154,7 +167,9 @@ def run_baseline(copy: Path, module: str, places: Sequence[str]) -> Baseline:
     return baseline
 
 
-def run_mutant(module: str, folder: Path, seconds: int, task: tuple[Mutant, set[str]]) -> str:
+def run_mutant(
+    module: str, folder: Path, seconds: int, patience: int, task: tuple[Mutant, set[str]]
+) -> str:
     """Run the tests of a mutant in this process's copy; return ``killed``, or another result."""
     mutant, chosen = task
     copy = folder / str(os.getpid())
@@ -165,7 +180,7 @@ def run_mutant(module: str, folder: Path, seconds: int, task: tuple[Mutant, set[
     own = f"test_{file.stem}"
     places = sorted({test.partition("::")[0] for test in chosen},
                     key=lambda name: (not Path(name).name.startswith(own), name))  # fmt: skip
-    child = start(copy, module, places, Plugin(file, chosen), seconds)
+    child = start(copy, module, places, Plugin(file, chosen, patience), seconds)
     deadline = time.monotonic() + 20 * seconds  # a test may sleep, and others need processors, too
     while not (ended := os.waitpid(child, os.WNOHANG))[0]:
         time.sleep(0.02)
@@ -207,7 +222,8 @@ def run_mutants(
             for mutant in sample
         ]  # fmt: skip
         tasks = [task for task in zip(sample, tests, strict=True) if task[1]]
-        work = partial(run_mutant, module, folder, 10 + round(2 * baseline.seconds))
+        patience = PATIENCE + round(SLOWER * baseline.slowest)
+        work = partial(run_mutant, module, folder, 10 + round(2 * baseline.seconds), patience)
         with get_context("fork").Pool(jobs) as pool:
             results = pool.imap(work, tasks)
             for mutant, chosen in zip(sample, tests, strict=True):

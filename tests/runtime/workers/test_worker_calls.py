@@ -163,7 +163,7 @@ async def test_the_kernels_limit_is_for_a_run_that_is_gone(
 async def test_in_real_time_a_process_keeps_off_the_core_of_the_loop(
     clock: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 1, 2})
+    monkeypatch.setattr(os, "sched_getaffinity", {0: {3, 1, 2}}.__getitem__)
 
     async def conditions() -> Any:
         async with tree(niceness=7):
@@ -179,7 +179,7 @@ async def test_in_real_time_a_process_keeps_off_the_core_of_the_loop(
 def test_no_core_is_spared_where_there_is_one_or_nobody_says(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
+    monkeypatch.setattr(os, "sched_getaffinity", {0: {0}}.__getitem__)
     assert module.spare_cores() == ()
     monkeypatch.delattr(os, "sched_getaffinity")
     assert module.spare_cores() == ()
@@ -254,7 +254,7 @@ async def test_a_closed_connection_of_a_process_that_goes_on_is_an_end(
 
 async def test_a_call_beyond_its_limit_is_killed_and_not_before(wall: Wall) -> None:
     deaths = Deaths()
-    async with tree(died=deaths, timeout=60.0) as plant:
+    async with tree(died=deaths) as plant:  # by default, a minute
         wall.now += 1000.0  # nothing is due while nobody calls
         assert await plant.call(Tree.echo, 1) == 1
         waiting = [asyncio.create_task(plant.call(Tree.wait, n)) for n in range(2)]
