@@ -16,7 +16,6 @@ from typing import Literal, NamedTuple
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import rankdata
 
 Floats = npt.NDArray[np.float64]
 
@@ -73,7 +72,9 @@ class Ranking(msgspec.Struct, frozen=True, kw_only=True):
 
 def ranks(values: Iterable[float]) -> Floats:
     """Return ranks from 1; equal values, also infinite ones, share the mean of theirs."""
-    return np.asarray(rankdata([*values]), np.float64)
+    # As `scipy.stats.rankdata`, whose import takes half a second of processor time.
+    _, places, counts = np.unique([*values], return_inverse=True, return_counts=True)
+    return np.asarray((np.cumsum(counts) - (counts - 1) / 2)[places], np.float64)
 
 
 def spearman(a: Iterable[float], b: Iterable[float]) -> float:

@@ -91,10 +91,11 @@ def reality(
         conditions=_names(conditions),
         systems=_names(systems),
     )
-    out, ledger, keys = out.absolute(), Ledger(results), keys_of(study, seeds)
+    out, ledger = out.absolute(), Ledger(results)
+    keys = keys_of(study, seeds) if truth else {}
     planned = make_plan(
         study,
-        keys if truth else {},
+        keys,
         out=out,
         truth=truths(truth, study.sequences),
         outside=outside,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from pathlib import Path
 from typing import Any
@@ -22,11 +23,16 @@ __all__ = ["small"]  # a fixture
 PUBLISHED = read_published().errors()
 
 
-@pytest.fixture(scope="module")
-def study() -> Study:
-    """A part of the project's own, with all systems."""
+@functools.cache
+def part() -> Study:
+    """Return a part of the project's own study, with all systems."""
     sequences, conditions = ["V1_01", "V1_02", "V1_03"], ["real", "exact"]
     return read_study().only(sequences=sequences, worlds=["poor", "rich"], conditions=conditions)
+
+
+@pytest.fixture
+def study() -> Study:
+    return part()
 
 
 @pytest.fixture(autouse=True)
@@ -34,6 +40,12 @@ def _without_a_plot(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
     """Drawing takes a second of processor time."""
     if "slow" not in request.keywords:
         monkeypatch.setattr("runtime.tools.reality.page.draw", lambda *_: False)
+
+
+@functools.cache
+def keys() -> dict[Run, str]:
+    """Return the keys of the part's runs, which take some 0.2 s to compute."""
+    return keys_of(part())
 
 
 def made_up(study: Study, **more: Any) -> dict[Run, Result]:
@@ -51,14 +63,13 @@ def made_up(study: Study, **more: Any) -> dict[Run, Result]:
             data="d",
             **more,
         )
-        for run, key in keys_of(study).items()
+        for run, key in keys().items()
     }
 
 
 def page(study: Study, count: dict[Run, Result], path: Path, old: Any = ()) -> str:
-    keys = keys_of(study)
     file = path / "REALITY.md"
-    write_page(study, read_published(), keys, count, [*old], file, "the command")
+    write_page(study, read_published(), keys(), count, [*old], file, "the command")
     text = file.read_text(encoding="utf-8")
     lines = text.splitlines()
     for number, line in enumerate(lines):  # each table is one
