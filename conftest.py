@@ -22,6 +22,16 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Have pytest-xdist run files in their order, of which the last ones are short.
+
+    By itself it runs those with few tests last: a report, a study, shadow maps. One of them keeps a
+    worker busy for seconds while the other has nothing left.
+    """
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
     """Exclude the tests themselves, a million objects, from garbage collection."""

@@ -61,14 +61,17 @@ class NodeResult(msgspec.Struct, frozen=True):
 
 def run_in_lockstep(main: Coroutine[Any, Any, R]) -> R:
     """Run a coroutine on a jumping loop: `asyncio.sleep` and time-outs take no real time."""
+    results: list[R] = []
 
-    async def prepared() -> R:
+    async def prepared() -> None:
         loop = asyncio.get_running_loop()
         event_loop.install(loop)
-        return await loop.create_task(main)
+        results.append(await loop.create_task(main))
 
+    # The runner's own task has no result: `signal.signal` formats it, all events of a run.
     with asyncio.Runner(loop_factory=LockstepLoop) as runner:
-        return runner.run(prepared())
+        runner.run(prepared())
+    return results[0]
 
 
 def run_node(

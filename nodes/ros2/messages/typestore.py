@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import msgspec
 import numpy as np
@@ -25,6 +25,7 @@ from nodes.ros2.messages.topics import NO_HASH, FrameNames, dds_type
 from runtime.errors import MissingDependencyError, suggest
 from runtime.extras import install_command
 from runtime.time.clock import SECOND
+from runtime.typed import override
 
 Distribution = Literal["humble", "iron", "jazzy", "kilted"]
 
@@ -38,6 +39,24 @@ def _hash_as_ros_2_does() -> None:
 
 class MessageError(ValueError):
     """Bytes do not hold the expected message; the error text has the reason."""
+
+
+class _Compiled(dict[str, Any]):
+    """Compiled definitions of a store, those of ROS's own types shared with all later stores."""
+
+    shared: ClassVar[dict[str, dict[str, Any]]] = {}
+    """By distribution; a definition takes some milliseconds."""
+
+    def __init__(self, distribution: str, standard: Collection[str]) -> None:
+        self._shared = self.shared.setdefault(distribution, {})
+        self._standard = frozenset(standard)
+        super().__init__(self._shared)
+
+    @override
+    def __setitem__(self, name: str, definition: Any) -> None:
+        super().__setitem__(name, definition)
+        if name in self._standard:
+            self._shared[name] = definition
 
 
 class TypeStore:
@@ -68,6 +87,7 @@ class TypeStore:
         self._error = SerdeError
         self._node, self._parse = Nodetype, get_types_from_msg
         self._store = get_typestore(Stores[f"ROS2_{distribution.upper()}"])
+        self._store.cache = _Compiled(distribution, self._store.fielddefs)
         self._hashed = distribution != "humble"
         for name, file in (definitions or {}).items():
             dds_type(name)

@@ -19,7 +19,7 @@ from sims.compiled import libraries
 
 FISHEYE = Lens(model="equidistant", coefficients=(0.01, 0.0, 0.0, 0.0))
 CAMERAS = tuple(
-    CameraSpec(name=name, width=120, height=90, fov=fov, position=(0.0, 0.0, 0.0), lens=lens)
+    CameraSpec(name=name, width=64, height=48, fov=fov, position=(0.0, 0.0, 0.0), lens=lens)
     for name, fov, lens in (("pinhole", 90.0, None), ("fisheye", 150.0, FISHEYE))
 )
 VIEWS = {camera.name: View(camera_info(camera)) for camera in CAMERAS}

@@ -310,13 +310,13 @@ def as_kitti_has_it(truth: Trajectory, estimate: Trajectory, lengths: list[float
     Each pose begins a stretch, which ends at the first pose beyond the length.
     """
     distances = truth.distances()
-    true, said = truth.matrices(), estimate.matrices()
+    motions = [(np.linalg.inv(m), m) for m in (estimate.matrices(), truth.matrices())]
     errors = []
     for length in lengths:
         for first in range(len(truth)):
             beyond = np.flatnonzero(distances > distances[first] + length)
             if len(beyond):
-                a, b = (np.linalg.inv(m[first]) @ m[beyond[0]] for m in (said, true))
+                a, b = (inverse[first] @ m[beyond[0]] for inverse, m in motions)
                 errors.append(np.linalg.norm((np.linalg.inv(a) @ b)[:3, 3]) / length)
     return 100.0 * float(np.mean(errors))
 

@@ -190,3 +190,18 @@ def test_a_range_of_humble_has_no_variance() -> None:
     made = outgoing.distance(Outgoing(old, PublishingConfig(), Stamps().out), distance)
     data = old.serialize(made)
     assert old.deserialize(bytes(data), "sensor_msgs/msg/Range").range == 1.5
+
+
+def test_stores_share_what_is_compiled_but_for_types_of_ones_own() -> None:
+    """A type compiled in one store is another's, too; one of the same name may differ."""
+    time, sample = "builtin_interfaces/msg/Time", "own_msgs/msg/Sample"
+    first = TypeStore()
+    first.add(sample, "uint8 value")
+    data = bytes(first.serialize(first.message(sample)(value=7)))
+    first.check(time)
+    second = TypeStore()
+    second.add(sample, "float64 value")
+    assert len(second.serialize(second.message(sample)(value=7.0))) == len(data) + 7
+    assert first.deserialize(data, sample).value == 7
+    assert second._store.get_msgdef(time) is first._store.get_msgdef(time)
+    assert TypeStore("humble")._store.get_msgdef(time) is not first._store.get_msgdef(time)
