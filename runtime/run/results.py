@@ -316,7 +316,7 @@ def private_results(out: Path) -> Iterator[Path]:
             yield private
         finally:
             try:
-                _private_results_move(private, out)
+                _move_private_results(private, out)
                 shutil.rmtree(private, ignore_errors=True)
             except OSError as error:
                 log.error("what was recorded stays in %s: it cannot be moved: %s", private, error)
@@ -344,11 +344,11 @@ def _is_left(folder: Path) -> bool:
     return False
 
 
-def _private_results_move(source: Path, target: Path) -> None:
+def _move_private_results(source: Path, target: Path) -> None:
     target.mkdir(parents=True, exist_ok=True)
     for entry in source.iterdir():
         destination = target / entry.name
         if entry.is_dir() and destination.is_dir():
-            _private_results_move(entry, destination)
+            _move_private_results(entry, destination)
         else:
             entry.replace(destination)
