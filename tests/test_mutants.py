@@ -51,6 +51,7 @@ def test_each_operator_changes_what_it_says(line: str, becomes: list[str]) -> No
 def test_what_runs_at_import_is_of_all_tests_and_types_are_no_values() -> None:
     source = b"""
 T = TypeVar("T")
+P = ParamSpec("P")
 __all__ = ["f"]
 Kind = Literal["a"]
 LIMIT = 3

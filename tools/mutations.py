@@ -86,7 +86,9 @@ def says_nothing(node: ast.AST) -> bool:
             return True
         case ast.Assign([ast.Name("__slots__" | "__all__")]) | ast.If(ast.Name("TYPE_CHECKING")):
             return True
-        case ast.Assign([ast.Name()], ast.Subscript(ast.Name()) | ast.Call(ast.Name("TypeVar"))):
+        case ast.Assign(
+            [ast.Name()], ast.Subscript(ast.Name()) | ast.Call(ast.Name("TypeVar" | "ParamSpec"))
+        ):
             return node.col_offset == 0  # a name of a type
     return False
 

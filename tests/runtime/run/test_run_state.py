@@ -197,11 +197,12 @@ class Busy(Node):
         self.release.wait(10)
 
 
-def test_a_run_ends_without_waiting_for_threads_and_begins_no_more_work() -> None:
+@pytest.mark.parametrize("clock", ["lockstep", "real"])
+def test_a_run_ends_without_waiting_for_threads_and_begins_no_more_work(clock: str) -> None:
     """Eight calls are under way; the command line knows their threads by name."""
     Busy.release, Busy.full = threading.Event(), threading.Event()
     Busy.begun.clear()
-    outcome = supervise([spec(Busy, "busy")], clock="real", shutdown_limit=0.01)
+    outcome = supervise([spec(Busy, "busy")], clock=clock, shutdown_limit=0.01)
     still_waiting = [t for t in threading.enumerate() if t.name in Busy.begun]
     Busy.release.set()
     assert outcome.reason == "enough"
