@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Annotated, Any
 
 import msgspec
@@ -96,7 +97,11 @@ def test_what_can_change_is_listed_with_its_values() -> None:
 
 
 @pytest.mark.parametrize("clock", ["lockstep", "real"])
-def test_a_change_in_a_run_holds_from_then_on_and_is_recorded(clock: str) -> None:
+def test_a_change_in_a_run_holds_from_then_on_and_is_recorded(
+    clock: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+
     async def body(supervisor: Supervisor) -> None:
         await until_sent(supervisor, "pilot", 1)
         assert supervisor.state.set_parameter("pilot.gain=3") == {"gain": "3.0"}
@@ -115,6 +120,7 @@ def test_a_change_in_a_run_holds_from_then_on_and_is_recorded(clock: str) -> Non
     looked = look(nodes, body, clock=clock, duration=0.4 if clock == "lockstep" else 60)
     (changed,) = [e for e in looked.sent if isinstance(e, ParameterChanged)]
     assert (changed.source, changed.key, changed.value) == ("pilot", "gain", "3.0")
+    assert [line for line in caplog.messages if "is now" in line] == ["pilot.gain is now 3.0"]
     gains = [e.velocity[0] for e in looked.sent if isinstance(e, VelocitySetpoint)]
     assert sorted(gains) == gains
     assert set(gains) == {1.0, 3.0}
