@@ -62,6 +62,12 @@ def test_a_missing_vocabulary_is_an_error_with_the_command_that_makes_one(tmp_pa
         run(camera("drone/front", "rgb", "depth"), vocabulary=missing)
 
 
+def test_it_is_not_started_without_loop_closing_as_it_would_crash(tmp_path: Path) -> None:
+    settings = {"vocabulary": str(tmp_path / "none.txt"), "orb": {"loop_closing": False}}
+    with pytest.raises(NodeError, match=r"orb\.loop_closing: expected true, found false"):
+        run(camera("drone/front", "rgb", "depth"), **settings)
+
+
 def test_a_file_in_another_format_is_refused_before_anything_starts(tmp_path: Path) -> None:
     """ORB-SLAM3 would end its process, or read nonsense."""
     other = tmp_path / "other.txt"

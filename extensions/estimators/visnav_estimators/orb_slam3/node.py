@@ -475,6 +475,11 @@ class OrbSlam3(Estimator[OrbSlam3Config]):
         if missing:
             return
         config = self.config
+        if not config.orb.loop_closing:
+            yield (
+                "orb.loop_closing: expected true, found false: without it ORB-SLAM3 crashes soon "
+                "after its map has begun (seen with pyorbslam3 0.1.1)"
+            )
         try:
             self._settings = make_settings(
                 config.mode, self.cameras, self.imu_announcement, config.orb

@@ -62,7 +62,7 @@ class OrbSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             variance is ``(z² / (baseline fx))²`` square metres per square pixel.
         close_depth: Depth in metres up to which a point enters the map at once; a farther one after
             two views.
-        loop_closing: Whether known places correct the map.
+        loop_closing: Whether known places correct the map; the node refuses false.
     """
 
     features: Annotated[int, msgspec.Meta(ge=100, le=10_000)] = 1000
