@@ -125,6 +125,14 @@ def test_a_page_of_a_part_says_how_large_it_is(study: Study, tmp_path: Path) -> 
     assert "0 of 11" in text
 
 
+def test_a_condition_may_be_flown_with_some_systems(study: Study, tmp_path: Path) -> None:
+    of_all = made_up(study)
+    part = {run: r for run, r in of_all.items() if run.condition == "real" or run.system == "dso"}
+    text = page(study, part, tmp_path)
+    assert "| dso | × 1 (10) |" in text
+    assert "| basalt | × " not in text
+
+
 def test_what_went_wrong_is_on_the_page(study: Study, tmp_path: Path) -> None:
     """Crashes, silence, stale results, and flights of different bytes."""
     count = made_up(study, flight="f")
