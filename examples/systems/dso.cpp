@@ -1,8 +1,9 @@
 // DSO, direct sparse odometry, as an estimator of a run with a single camera, by the native interface.
 //
 // It answers with the pose of the camera in DSO's world, whose unit of length is arbitrary. All is
-// computed in the caller's thread, one frame after the other. The mode is that of "perfect images":
-// the run's have one exposure and no vignette, so that no brightness is estimated.
+// computed in the caller's thread, one frame after the other. The argument is DSO's own: `mode=2`, if
+// there is none, takes images as perfect (one exposure, no vignette, little noise); `mode=1` is for cameras
+// without photometric calibration, as EuRoC's, and estimates the brightness of each frame.
 #define BOOST_BIND_GLOBAL_PLACEHOLDERS  // which DSO's headers use
 #include <boost/bind.hpp>
 
@@ -16,6 +17,7 @@
 
 #include <iostream>
 #include <memory>
+#include <string>
 
 #include "visnav_link.hpp"
 
@@ -50,12 +52,12 @@ struct System {
     EIGEN_MAKE_ALIGNED_OPERATOR_NEW
 };
 
-void configure(const visnav::Camera& camera) {
+void configure(const visnav::Camera& camera, bool perfect) {
     for (double each : camera.distortion)
         if (each != 0.0) throw visnav::Error("expected a camera without distortion");
     dso::setting_photometricCalibration = 0;
-    dso::setting_affineOptModeA = dso::setting_affineOptModeB = -1;
-    dso::setting_minGradHistAdd = 3;
+    dso::setting_affineOptModeA = dso::setting_affineOptModeB = perfect ? -1 : 0;
+    if (perfect) dso::setting_minGradHistAdd = 3;
     dso::multiThreading = false;
     dso::disableAllDisplay = true;
     dso::setting_logStuff = false;
@@ -67,10 +69,13 @@ void configure(const visnav::Camera& camera) {
 
 }  // namespace
 
-int main() try {
+int main(int argc, char** argv) try {
+    const std::string mode = argc > 1 ? argv[1] : "mode=2";
+    if (argc > 2 || (mode != "mode=1" && mode != "mode=2"))
+        throw visnav::Error("expected mode=1, mode=2 or no argument, found " + mode);
     visnav::Link link("DSO");
     const visnav::Camera camera = link.camera(0);
-    configure(camera);
+    configure(camera, mode == "mode=2");
     auto system = std::make_unique<System>();
     dso::ImageAndExposure image(camera.width, camera.height);
     link.ready();
