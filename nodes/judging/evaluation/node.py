@@ -426,8 +426,9 @@ class Evaluation(Node[EvaluationConfig]):
             write_results(self.out, plans, judgements, verdict)
             for name, record in self._records.items():
                 if record.longest is not next(iter(record.maps.values()), record.longest):
-                    # Its file has the first map, as it came.
-                    path, head = self._trajectory_file(source_file(name), record.longest.frame_id)
+                    file_name = source_file(name)
+                    path, head = self._trajectory_file(file_name, record.longest.frame_id)
+                    path.replace(self.out / "evaluation" / f"{file_name}.first_map.tum")
                     write_tum(path, record.longest.rows.trajectory(), head)
             collisions = [c for flight in self._flights.values() for c in flight.collisions]
             file = self.out / "trajectories" / "collisions.csv"

@@ -233,6 +233,8 @@ def test_a_second_map_with_more_poses_is_what_is_judged_scored_and_written(tmp_p
     written = tmp_path / "trajectories" / "est.tum"
     assert read_tum(written).stamps.tolist() == [*FRAMES[3:11]]
     assert "in odom_1, as it was sent" in written.read_text()
+    first_map = read_tum(tmp_path / "evaluation" / "est.first_map.tum")
+    assert first_map.stamps.tolist() == [*FRAMES[:3]]
     figures = json.loads((tmp_path / "evaluation" / "verdict.json").read_text())["estimators"][
         "est"
     ]

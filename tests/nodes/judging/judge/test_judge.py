@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -193,6 +194,18 @@ def test_topics_of_bags_are_read_in_our_frames(type_: str, tmp_path: Path) -> No
         assert (figures["restarts"], figures["estimates"]) == (0, 200)
 
 
+WORDS = "--truth", "truth.tum", "--estimate", "slam=bag:/slam/poses"
+
+
+def judge_changed(
+    folder: Path, truth: Trajectory, change: Callable[[int, Any], Any]
+) -> dict[str, Any]:
+    """Judge a topic whose messages have been changed, and which fails."""
+    write_tum(folder / "truth.tum", truth, FRAMES.format("map (NED)"))
+    bags.bag(folder / "bag", bags.POSE, truth, frame_id="odom", change=change)
+    return only(judge(folder, *WORDS, code=1))
+
+
 @pytest.mark.parametrize(("changes_at", "left_out"), [(20, 20), (150, 50)])
 def test_of_a_topics_frames_the_one_with_most_poses_is_judged(
     tmp_path: Path, changes_at: int, left_out: int
@@ -202,14 +215,10 @@ def test_of_a_topics_frames_the_one_with_most_poses_is_judged(
         message.pose.position.x += 50.0 if number <= changes_at else 0.0  # no frame fits the other
         return message
 
-    truth = walk(200, start=10**18)
-    write_tum(tmp_path / "truth.tum", truth, FRAMES.format("map (NED)"))
-    bags.bag(tmp_path / "bag", bags.POSE, truth, frame_id="odom", change=change)
-    words = ["--truth", "truth.tum", "--estimate", "slam=bag:/slam/poses"]
-    figures = judge(tmp_path, *words, code=1)["slam"]
+    figures = judge_changed(tmp_path, walk(200, start=10**18), change)
     assert (figures["restarts"], figures["estimates"]) == (1, 200 - left_out)
     assert figures["ate_rmse_m"] == pytest.approx(0.0, abs=1e-6)
-    assert f"left out: {left_out} poses in another frame" in said(tmp_path, *words).stderr
+    assert f"left out: {left_out} poses in another frame" in said(tmp_path, *WORDS).stderr
 
 
 def test_restarts_and_repeated_stamps_of_a_topic_are_counted_and_fail(tmp_path: Path) -> None:
@@ -220,10 +229,7 @@ def test_restarts_and_repeated_stamps_of_a_topic_are_counted_and_fail(tmp_path: 
         return message
 
     truth = walk(200, start=10**18)
-    write_tum(tmp_path / "truth.tum", truth, FRAMES.format("map (NED)"))
-    bags.bag(tmp_path / "bag", bags.POSE, truth, frame_id="odom", change=change)
-    words = ["--truth", "truth.tum", "--estimate", "slam=bag:/slam/poses"]
-    figures = judge(tmp_path, *words, code=1)["slam"]
+    figures = judge_changed(tmp_path, truth, change)
     assert (figures["restarts"], figures["repeated_stamps"], figures["estimates"]) == (1, 1, 188)
     assert [text.partition(":")[0] for text in figures["failed"]] == ["restarts", "repeated_stamps"]
     done = said(tmp_path, "--truth", "bag:/slam/poses", "--estimate", "truth.tum")
