@@ -1,6 +1,7 @@
 // DSO, direct sparse odometry, as an estimator of a run with a single camera, by the native interface.
 //
-// It answers with the pose of the camera in DSO's world, whose unit of length is arbitrary. All is
+// It answers with the pose of the camera in DSO's world, whose unit of length is arbitrary, and at the end
+// gives those of the keyframes after all optimizations, which DSO itself writes as its result. All is
 // computed in the caller's thread, one frame after the other. The argument is DSO's own: `mode=2`, if
 // there is none, takes images as perfect (one exposure, no vignette, little noise); `mode=1` is for cameras
 // without photometric calibration, as EuRoC's, and estimates the brightness of each frame.
@@ -16,8 +17,10 @@
 #include <util/settings.h>
 
 #include <iostream>
+#include <map>
 #include <memory>
 #include <string>
+#include <vector>
 
 #include "visnav_link.hpp"
 
@@ -26,14 +29,25 @@ namespace {
 // Keyframes until DSO no longer takes its initialization back, as it may, and begins anew.
 constexpr int sure = 4;
 
-// Keeps what DSO says of the frame that it gets: its pose changes until the frame is done.
-struct Latest : dso::IOWrap::Output3DWrapper {
+visnav::Pose pose_of(const dso::FrameShell& frame) {
+    visnav::Pose pose;
+    Eigen::Map<Eigen::Matrix<double, 3, 4, Eigen::RowMajor>>(pose.matrix.data()) =
+        frame.camToWorld.matrix3x4();
+    return pose;
+}
+
+// Keeps what DSO says of the frame that it gets, whose pose changes until the frame is done, and the
+// keyframes' poses, which change until they leave DSO's window.
+struct Output : dso::IOWrap::Output3DWrapper {
     dso::FrameShell* frame = nullptr;
     int keyframes = 0;
+    std::map<int, visnav::Pose> trajectory;  // by the number of the frame
 
     void publishCamPose(dso::FrameShell* tracked, dso::CalibHessian*) override { frame = tracked; }
     void publishKeyframes(std::vector<dso::FrameHessian*>& frames, bool final,
                           dso::CalibHessian*) override {
+        for (const dso::FrameHessian* keyframe : frames)
+            trajectory[keyframe->shell->incoming_id] = pose_of(*keyframe->shell);
         if (final) return;
         frame = frames.back()->shell;
         ++keyframes;
@@ -41,13 +55,13 @@ struct Latest : dso::IOWrap::Output3DWrapper {
 };
 
 struct System {
-    Latest latest;
+    Output output;
     dso::FullSystem full;
 
     System() {
         full.setGammaFunction(nullptr);
         full.linearizeOperation = true;  // else a thread of its own decides what is a keyframe
-        full.outputWrapper.push_back(&latest);
+        full.outputWrapper.push_back(&output);
     }
     EIGEN_MAKE_ALIGNED_OPERATOR_NEW
 };
@@ -78,7 +92,8 @@ int main(int argc, char** argv) try {
     configure(camera, mode == "mode=2");
     auto system = std::make_unique<System>();
     dso::ImageAndExposure image(camera.width, camera.height);
-    link.ready();
+    link.ready(visnav::Link::PoseOf::camera, true);
+    std::vector<std::int64_t> stamps;  // by the number of the frame
     while (const auto frame = link.next()) {
         const visnav::Image& grey = frame->image("mono8");
         for (int v = 0; v < grey.height; ++v)
@@ -87,22 +102,24 @@ int main(int argc, char** argv) try {
         const int number = static_cast<int>(frame->sequence);
         system->full.addActiveFrame(&image, number);
 
-        const Latest& latest = system->latest;
-        const bool begun = latest.keyframes >= sure;
+        stamps.push_back(frame->stamp);
+        const Output& output = system->output;
+        const bool begun = output.keyframes >= sure;
         if (!begun && (system->full.initFailed || system->full.isLost)) {
             link.initialising(*frame);
             system = std::make_unique<System>();
         } else if (!begun) {
             link.initialising(*frame);
-        } else if (system->full.isLost || latest.frame->incoming_id != number) {
+        } else if (system->full.isLost || output.frame->incoming_id != number) {
             link.lost(*frame);  // for good: DSO does not relocalize
         } else {
-            visnav::Pose pose;
-            Eigen::Map<Eigen::Matrix<double, 3, 4, Eigen::RowMajor>>(pose.matrix.data()) =
-                latest.frame->camToWorld.matrix3x4();
-            link.pose(*frame, pose);
+            link.pose(*frame, pose_of(*output.frame));
         }
     }
+    std::vector<visnav::StampedPose> trajectory;
+    for (const auto& [number, pose] : system->output.trajectory)
+        trajectory.push_back({stamps.at(static_cast<std::size_t>(number)), pose});
+    link.trajectory(trajectory);
 } catch (const std::exception& error) {
     std::cerr << error.what() << '\n';
     return 1;

@@ -6,7 +6,13 @@ both are in. `endpoint` is the run's side, `answers` checks what comes from the 
 of the run. docs/reference/link.md has the protocol, byte by byte.
 """
 
-from nodes.outside.native.answers import LinkAnswer, LinkError, LinkOrder, describe
+from nodes.outside.native.answers import (
+    LinkAnswer,
+    LinkError,
+    LinkOrder,
+    LinkTrajectory,
+    describe,
+)
 from nodes.outside.native.endpoint import Endpoint
 
-__all__ = ["Endpoint", "LinkAnswer", "LinkError", "LinkOrder", "describe"]
+__all__ = ["Endpoint", "LinkAnswer", "LinkError", "LinkOrder", "LinkTrajectory", "describe"]

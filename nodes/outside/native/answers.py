@@ -6,7 +6,7 @@ Also the JSON text of WELCOME: the description of the run's cameras, inputs and 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -22,6 +22,7 @@ from nodes.outside.native.client import (
     ORDER_BODY,
     ORDERS,
     POSE_HEAD,
+    STAMPED_POSE,
     STATUS,
     VELOCITY,
 )
@@ -77,6 +78,15 @@ class LinkAnswer(msgspec.Struct, frozen=True, eq=False):
     before: tuple[LinkAnswer | LinkOrder, ...] = ()
 
 
+class LinkTrajectory(NamedTuple):
+    """Final trajectory of a program."""
+
+    stamps: npt.NDArray[np.int64]  # those of frames (ns), strictly rising, shape (n,)
+    # The optical camera 0 (the body, without a camera) in that of the program's first pose, shape
+    # (n, 4, 4).
+    poses: npt.NDArray[np.float64]
+
+
 def read_done(body: bytearray) -> LinkAnswer:
     """Read the body of a DONE.
 
@@ -125,15 +135,7 @@ def read_pose(body: bytearray) -> LinkAnswer:
         raise LinkError(f"POSE: expected {expected} bytes for {count} points, found {len(body)}")
     pose, at = None, POSE_HEAD.size
     if status == "tracked":
-        pose = np.eye(4)
-        pose[:3] = np.frombuffer(body, "<f8", 12, at).reshape(3, 4)
-        _finite("POSE.pose", pose)
-        if (far := np.abs(pose).max()) > FARTHEST:
-            raise LinkError(f"POSE.pose: expected at most {FARTHEST:g} m, found {far:g}")
-        turn = pose[:3, :3]
-        miss = max(np.abs(turn @ turn.T - np.eye(3)).max(), 1.0 - np.linalg.det(turn))
-        if miss > TOLERANCE:
-            raise LinkError(f"POSE.pose: expected a rotation within {TOLERANCE:g}, off by {miss:g}")
+        pose = _checked_poses("POSE.pose", np.frombuffer(body, "<f8", 12, at).reshape(1, 3, 4))[0]
     at += MATRIX
     arrays = np.split(np.frombuffer(body, "<f8", numbers, at), [36] if follows & COVARIANCE else [])
     covariance = arrays[0].reshape(6, 6) if follows & COVARIANCE else None
@@ -146,6 +148,41 @@ def read_pose(body: bytearray) -> LinkAnswer:
     inliers = np.frombuffer(body, "u1", count, at + 8 * count) != 0
     fields: Any = status, pose, covariance, velocity, points, inliers, output
     return LinkAnswer(sequence, stamp, *fields)
+
+
+def read_trajectory(body: bytearray) -> LinkTrajectory:
+    """Read the body of a TRAJECTORY; poses are as the program gave them.
+
+    Raises:
+        LinkError: It is not as the protocol says, or not finite, or has no rotation.
+    """
+    if len(body) % STAMPED_POSE.itemsize:
+        raise LinkError(
+            f"TRAJECTORY: expected {STAMPED_POSE.itemsize} bytes a pose, found {len(body)} in all"
+        )
+    rows = np.frombuffer(body, STAMPED_POSE)
+    stamps = rows["stamp"].astype(np.int64)
+    if (falls := np.flatnonzero(np.diff(stamps) <= 0)).size:
+        before, after = stamps[falls[0]], stamps[falls[0] + 1]
+        raise LinkError(
+            f"TRAJECTORY.stamp: expected them to rise strictly, found {after} after {before}"
+        )
+    return LinkTrajectory(stamps, _checked_poses("TRAJECTORY.pose", rows["pose"]))
+
+
+def _checked_poses(field: str, rows: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return transforms, shape (n, 4, 4), of their first three rows, shape (n, 3, 4)."""
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = rows
+    _finite(field, poses)
+    if (far := np.abs(poses).max(initial=0.0)) > FARTHEST:
+        raise LinkError(f"{field}: expected at most {FARTHEST:g} m, found {far:g}")
+    turns = poses[:, :3, :3]
+    misses = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    miss = np.maximum(misses, 1.0 - np.linalg.det(turns)).max(initial=0.0)
+    if miss > TOLERANCE:
+        raise LinkError(f"{field}: expected a rotation within {TOLERANCE:g}, off by {miss:g}")
+    return poses
 
 
 def _finite(field: str, values: npt.NDArray[np.floating] | None) -> None:
@@ -183,6 +220,16 @@ class CameraPoses:
             covariance=covariance,
             velocity=None if velocity is None else turn @ velocity,
         )
+
+    def of_trajectory(self, trajectory: LinkTrajectory) -> LinkTrajectory:
+        """Return a trajectory in the frame of the first pose, or of its own first without one."""
+        stamps, poses = trajectory
+        if self._body_from_camera is not None:
+            poses = poses @ self._body_from_camera
+        origin = self._origins.get(0)
+        if origin is None and len(poses):
+            origin = inverse(poses[0])
+        return trajectory if origin is None else LinkTrajectory(stamps, origin @ poses)
 
 
 def describe(

@@ -32,7 +32,7 @@ import numpy.typing as npt
 MAGIC, VERSION = b"VISNAVLK", 2
 HELLO, WELCOME, REFUSED, READY, BYE = 1, 2, 3, 4, 5
 INPUT, FRAME = 16, 17
-POSE, DONE, LOG, ORDER = 32, 33, 34, 35
+POSE, DONE, LOG, ORDER, TRAJECTORY = 32, 33, 34, 35, 36
 
 HEADER = struct.Struct("<II")  # of each message: length of its body (bytes), type
 GREETING = struct.Struct("<8sII")  # begins HELLO, WELCOME and REFUSED: magic, version, 0
@@ -43,6 +43,7 @@ IMAGE_HEAD = struct.Struct("<IIIIIIQ")  # camera, kind, height, width, stride (b
 POSE_HEAD = struct.Struct("<QqIIII")  # sequence, stamp, status, follows, points, output
 DONE_BODY = struct.Struct("<Qq")  # sequence, stamp (ns)
 ORDER_BODY = struct.Struct("<QqII8d")  # sequence, stamp, order, axes, numbers
+READY_BODY = struct.Struct("<II")  # whose poses, whether a trajectory comes after the run's BYE
 LONGEST, LONGEST_TEXT = 1 << 24, 4096  # bytes of a body; of a name, a reason, a line of the log
 
 _FIELDS: dict[str, list[tuple[Any, ...]]] = {
@@ -80,6 +81,9 @@ KINDS: dict[str, tuple[int, np.dtype[Any], tuple[int, ...]]] = {
     "depth32f": (3, np.dtype("<f4"), ()),
     "segmentation32i": (4, np.dtype("<i4"), ()),
 }  # kinds of image: number, type of a value, values of a pixel
+
+STAMPED_POSE = np.dtype([("stamp", "<i8"), ("pose", "<f8", (3, 4))])
+"""A pose of a trajectory: of a stamp (ns), metres."""
 
 ORDERS = {"takeoff": 0, "land": 1, "position": 2, "velocity": 3}
 AXES = {"map": 0, "heading": 1}
@@ -200,9 +204,14 @@ class Link:
                 os.close(fd)
         return dict(json.loads(body[GREETING.size + MEMORY.size :]))
 
-    def ready(self, pose_of: str = "camera") -> None:
-        """Send READY, and whose poses will be sent: of the optical camera 0, or the body."""
-        self._send(READY, struct.pack("<II", POSE_OF[pose_of], 0))
+    def ready(self, pose_of: str = "camera", trajectory: bool = False) -> None:
+        """Send READY, and what will be sent.
+
+        Args:
+            pose_of: Whose poses: of the optical ``camera`` 0, or the ``body``.
+            trajectory: Whether a trajectory comes when the run has ended; see `trajectory`.
+        """
+        self._send(READY, READY_BODY.pack(POSE_OF[pose_of], trajectory))
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames until the run ends, each with its inputs."""
@@ -333,6 +342,20 @@ class Link:
         numbers = *np.asarray(position, float), *np.asarray(velocity, float), yaw, yaw_rate
         head = frame.sequence, frame.stamp, ORDERS[order], AXES[axes]
         self._send(ORDER, ORDER_BODY.pack(*head, *numbers))
+
+    def trajectory(self, stamps: npt.ArrayLike, poses: npt.ArrayLike) -> None:
+        """Give the final trajectory, after the last frame, if `ready` promised it.
+
+        Args:
+            stamps: Those of frames (ns), strictly rising, shape (n,).
+            poses: As those of `pose`, in the same frame, shape (n, 4, 4) or (n, 3, 4).
+        """
+        matrices = np.asarray(poses, "<f8")
+        rows = np.empty(len(matrices), STAMPED_POSE)
+        rows["stamp"] = stamps
+        if len(rows):
+            rows["pose"] = matrices[:, :3]
+        self._send(TRAJECTORY, rows.tobytes())
 
     def log(self, text: str) -> None:
         """Write a line into the run's log."""

@@ -28,9 +28,11 @@ from nodes.outside.native.answers import (
     LinkAnswer,
     LinkError,
     LinkOrder,
+    LinkTrajectory,
     read_done,
     read_order,
     read_pose,
+    read_trajectory,
 )
 from runtime.workers.output import plain_lines
 from runtime.workers.shared_memory import anonymous_file
@@ -46,7 +48,7 @@ READERS: dict[int, Callable[[bytearray], LinkAnswer | LinkOrder]] = {
     wire.ORDER: read_order,
 }
 
-POSE_OF = {number.to_bytes(4, "little"): name for name, number in wire.POSE_OF.items()}
+POSE_OF = {number: name for name, number in wire.POSE_OF.items()}
 
 MOST_BEFORE = 64  # most outputs and orders before the answer to a frame
 ALIGNMENT = 64
@@ -74,6 +76,9 @@ class _Program:
         self.lent: dict[int, _Lent] = {}  # by sequence
         self.free = list(range(slots))
         self.gone = False
+        self.promised = self.finished = False  # a trajectory; whether it knows that the run ended
+        self.trajectory: LinkTrajectory | None = None
+        self.end_reason = ""
         self._received = bytearray()
 
     def receive(self) -> Iterator[tuple[int, bytearray]]:
@@ -113,6 +118,9 @@ class _Program:
                     self.connection.send(wire.message(kind, *parts), socket.MSG_DONTWAIT)
                 finally:
                     self.sending.release()
+        self.disconnect()
+
+    def disconnect(self) -> None:
         with contextlib.suppress(OSError):
             self.connection.shutdown(socket.SHUT_RDWR)
 
@@ -127,7 +135,7 @@ class Endpoint:
 
     Args:
         gone: Called once when the program is gone or is disconnected, with the reason. Not after
-            `close`.
+            `close`, nor of a program whose trajectory `finish` awaits.
         logged: Called with each text for the log, unchecked and unlimited.
     """
 
@@ -259,6 +267,30 @@ class Endpoint:
                     program.free.append(program.lent.pop(sequence).slot)
                 self._changed.notify_all()
 
+    @property
+    def promised(self) -> bool:
+        """Return whether a program is there that promised its final trajectory."""
+        return self._program is not None and self._program.promised
+
+    def finish(self, seconds: float) -> LinkTrajectory:
+        """Send BYE, and wait at most `seconds` (real time) for the trajectory `promised`.
+
+        Raises:
+            LinkError: It did not come.
+        """
+        if (program := self._program) is None:
+            raise LinkError("expected a program with its trajectory, found none")
+        program.finished = True
+        program.send(wire.BYE)
+        with self._changed:
+            self._changed.wait_for(
+                lambda: program.trajectory or program.gone or self._closed, seconds
+            )
+            if program.trajectory is None:
+                found = program.end_reason or f"none within {seconds:g} s"
+                raise LinkError(f"{program.name}: expected its trajectory, found {found}")
+            return program.trajectory
+
     def close(self) -> None:
         """Send BYE, disconnect, and remove the socket; takes two seconds at most."""
         with self._changed:
@@ -272,7 +304,10 @@ class Endpoint:
             with contextlib.suppress(OSError):  # wakes the reader, which closes it
                 self._listener.shutdown(socket.SHUT_RDWR)
             for program in list(self._programs):
-                program.end(wire.BYE)
+                if program.finished:
+                    program.disconnect()
+                else:
+                    program.end(wire.BYE)
             if self._reader is not threading.current_thread():
                 self._reader.join(1.0)
         os.close(self._file)
@@ -325,7 +360,7 @@ class Endpoint:
     def _drop(self, program: _Program, reason: str, wrong: bool = False) -> None:
         """End a connection; `wrong` if the program broke the protocol."""
         with self._changed:
-            program.gone = True
+            program.gone, program.end_reason = True, reason
             if self._program is program:
                 self._program = None
             if program.name and not program.poses and self._program is None:
@@ -338,7 +373,7 @@ class Endpoint:
         program.end(*head, reason.encode())
         program.connection.close()
         self._programs.remove(program)
-        if program.poses and not closed:
+        if program.poses and not closed and not program.finished:
             self._gone(f"{program.name}: {reason}")
 
     def _greet(self, program: _Program, kind: int, body: bytearray) -> None:
@@ -367,19 +402,31 @@ class Endpoint:
         if kind == wire.LOG:
             self._logged(body[: wire.LONGEST_TEXT])
         elif kind == wire.READY and not program.poses:
-            if body[4:] != bytes(4) or bytes(body[:4]) not in POSE_OF:
-                raise LinkError(f"READY.pose_of: expected 0 or 1, found {bytes(body)!r}")
-            pose_of = POSE_OF[bytes(body[:4])]
+            if len(body) != wire.READY_BODY.size:
+                raise LinkError(f"READY: expected {wire.READY_BODY.size} bytes, found {len(body)}")
+            number, promised = wire.READY_BODY.unpack(body)
+            if number not in POSE_OF:
+                raise LinkError(f"READY.pose_of: expected 0 or 1, found {number}")
+            if promised > 1:
+                raise LinkError(f"READY.trajectory: expected 0 or 1, found {promised}")
+            pose_of, program.promised = POSE_OF[number], bool(promised)
             if pose_of == "camera" and self._body_from_camera is None:
                 raise LinkError("READY.pose_of: expected 1, the body: there is no camera")
             with self._changed:
                 program.poses = CameraPoses(self._body_from_camera if pose_of == "body" else None)
                 self._changed.notify_all()
             self._on_ready()
+        elif kind == wire.TRAJECTORY and program.poses and program.promised:
+            if program.trajectory is not None:
+                raise LinkError("TRAJECTORY: expected one, found a second")
+            trajectory = program.poses.of_trajectory(read_trajectory(body))
+            with self._changed:
+                program.trajectory = trajectory
+                self._changed.notify_all()
         elif kind in READERS and program.poses:
             self._record(program, program.poses, READERS[kind](body))
         else:
-            expected = "READY once, POSE, DONE, ORDER, LOG or BYE"
+            expected = "READY once, POSE, DONE, ORDER, a promised TRAJECTORY, LOG or BYE"
             raise LinkError(f"expected {expected}, found type {kind}")
 
     def _record(

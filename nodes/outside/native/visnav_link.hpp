@@ -151,6 +151,12 @@ struct Pose {
     }
 };
 
+struct StampedPose {
+    std::int64_t stamp;                 // of a frame (ns)
+    Pose pose;
+};
+static_assert(sizeof(StampedPose) == 104);
+
 // The description: its values' texts by their place, as "cameras.0.info.fx": "256.0".
 class Description : public std::map<std::string, std::string> {
 public:
@@ -255,9 +261,10 @@ public:
         return found;
     }
 
-    // Tell the run to begin, and whose poses come: of the optical camera 0, or of the body (FRD).
-    void ready(PoseOf of = PoseOf::camera) {
-        send(4, words(of, 0));
+    // Tell the run to begin, and what comes: poses of the optical camera 0, or of the body (FRD), and
+    // whether a trajectory when the run has ended.
+    void ready(PoseOf of = PoseOf::camera, bool trajectory = false) {
+        send(4, words(of, trajectory));
     }
 
     // Wait for the next frame, with the inputs since the one before; nothing: the run ended.
@@ -304,6 +311,13 @@ public:
                                   velocity[1], velocity[2], yaw, yaw_rate};
         append(body, numbers, sizeof numbers);
         send(35, body);
+    }
+    // Give the final trajectory after the last frame, if ready() promised it: poses of frames, in
+    // the frame of those answered, the stamps rising.
+    void trajectory(const std::vector<StampedPose>& poses) {
+        std::string body;
+        append(body, poses.data(), poses.size() * sizeof(StampedPose));
+        send(36, body);
     }
     void log(const std::string& text) { send(34, text); }       // a line of the run's log
 

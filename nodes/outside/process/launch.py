@@ -87,7 +87,8 @@ class ProcessConfig(EstimatorConfig):
             ``ros2``, set it at the subscriptions of the bridge instead.
         files: Files written before the program starts.
         timeout: Real seconds for the program to connect.
-        grace: Real seconds to end after the last frame, and again after SIGTERM.
+        grace: Real seconds to send a promised trajectory after the last frame, to end, and again
+            after SIGTERM.
     """
 
     command: tuple[str, ...] = ()

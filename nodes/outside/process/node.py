@@ -380,6 +380,27 @@ class Process(Estimator[ProcessConfig]):
 
     # After the run.
 
+    async def on_end(self) -> None:
+        """Send the program's final trajectory, if it promised one."""
+        if self._feed is None or not self._feed.promised:
+            return
+        self._closing = True
+        try:
+            trajectory = await self.offload(self._feed.finish, float(self.config.grace))
+        except LinkError as error:
+            if self.config.hold.on_missing == "error":
+                raise ProgramError(str(error)) from None
+            self.log.warning("%s", error)
+            return
+        if not len(trajectory.stamps):
+            self.log.warning("its final trajectory is empty")
+            return
+        offset = self.the_camera().time_offset if self.config.images else 0.0
+        stamps = trajectory.stamps - round(offset * 1e9)
+        if not self._mounts:
+            self._mount(0, int(stamps[0]))
+        self.publish_trajectory(stamps, trajectory.poses)
+
     async def on_shutdown(self) -> None:
         """Close the connection, and end the program if still running."""
         if unsent := self._unsent + (self._feed.left_out if self._feed else 0):

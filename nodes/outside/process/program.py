@@ -38,7 +38,7 @@ from events import (
     TrackingLost,
 )
 from events.geometry import pose_matrix
-from nodes.outside.native import Endpoint, LinkAnswer, LinkError
+from nodes.outside.native import Endpoint, LinkAnswer, LinkError, LinkTrajectory
 from nodes.outside.native.client import RECORDS
 from nodes.outside.native.rows import kind_of, row_kind, rows_of
 from runtime.channels.hold import Hold
@@ -241,6 +241,24 @@ class Feed:
     def send(self, stamp: int, exposure: Exposure, inputs: Sequence[Message]) -> None:
         """Queue inputs, and then a frame of a stamp (ns), for sending."""
         self._outbox.put((stamp, exposure, inputs))
+
+    @property
+    def promised(self) -> bool:
+        """Return whether the program promised its final trajectory."""
+        return self._endpoint.promised
+
+    def finish(self, seconds: float) -> LinkTrajectory:
+        """Send all frames that wait, and return the trajectory that the program sends then.
+
+        Takes `seconds` (real time) at most.
+
+        Raises:
+            LinkError: It did not come.
+        """
+        until = time.monotonic() + seconds
+        self._outbox.put(None)
+        self._sender.join(seconds)
+        return self._endpoint.finish(max(until - time.monotonic(), 0.0))
 
     def close(self) -> None:
         """Close the connection to the program; takes two seconds at most."""

@@ -73,7 +73,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     def failed(self, system: System, study: Study) -> bool:
         """Return whether too little is there to judge: no error, or too few poses."""
-        coverage = self.final_percent if system.final else self.coverage_percent
+        coverage = self.final_percent if system.final == "map" else self.coverage_percent
         few = coverage is not None and coverage < study.coverage_percent
         return self.verdict != "passed" or few or not math.isfinite(self.error_m(system))
 

@@ -73,7 +73,8 @@ class System(Entrant, frozen=True, kw_only=True, forbid_unknown_fields=True):
         published: Row of its published figures; empty if there are none.
         alignment: With the truth, before errors are computed; ``origin`` is by the position and
             heading of the first pose.
-        final: Whether the published error is that of the final map, else of the poses as said.
+        final: Whose error is published: the final ``map``'s, its ``keyframes``' alone, whose share
+            of the images says nothing, or, if empty, that of the poses as they came.
         set: What its flight needs to have different, as for ``--set``.
         cost_ms: Processor time of a frame, for the estimate.
         why_not: Why it is reported and not counted; empty if it is counted.
@@ -81,7 +82,7 @@ class System(Entrant, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     published: str = ""
     alignment: Literal["origin", "se3", "sim3"] = "se3"
-    final: bool = False
+    final: Literal["", "map", "keyframes"] = ""
     set: tuple[str, ...] = ()
     cost_ms: float = 50.0
     why_not: str = ""

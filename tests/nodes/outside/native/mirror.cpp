@@ -13,8 +13,10 @@ int main() try {
              " " + std::to_string(camera.distortion.size()) + " " +
              std::to_string(std::lround(1000 * camera.fx)) + " " +
              link.description().text("clock.kind"));
-    link.ready();
+    link.ready(visnav::Link::PoseOf::camera, true);
+    std::vector<visnav::StampedPose> trajectory;
     while (const auto frame = link.next()) {
+        trajectory.push_back({frame->stamp, visnav::Pose::from_quaternion(double(trajectory.size()), 0, 0, 0, 0, 0, 1)});
         double colours = 0, depths = 0, imu = 0;
         const visnav::Image &rgb = frame->image("rgb8"), &depth = frame->image("depth32f");
         for (int v = 0; v < rgb.height; ++v) {
@@ -34,6 +36,7 @@ int main() try {
         default: link.done(*frame);
         }
     }
+    link.trajectory(trajectory);
 } catch (const std::exception& error) {
     std::fprintf(stderr, "%s\n", error.what());
     return 3;

@@ -18,8 +18,10 @@ def main() -> None:
             f"{len(info['distortion'])} {round(1000 * info['fx'])} "
             f"{link.description['clock']['kind']}"
         )
-        link.ready()
+        link.ready(trajectory=True)
+        stamps = []
         for frame in link:
+            stamps.append(frame.stamp)
             imu = frame.rows("imu")
             pose = np.eye(4)
             pose[:3, 3] = (
@@ -47,6 +49,9 @@ def main() -> None:
                 (link.lost if frame.sequence % 8 == 2 else link.initialising)(frame)
             else:
                 link.done(frame)
+        poses = np.tile(np.eye(4), (len(stamps), 1, 1))
+        poses[:, 0, 3] = np.arange(len(stamps))
+        link.trajectory(stamps, poses)
 
 
 try:

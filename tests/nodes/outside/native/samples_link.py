@@ -7,7 +7,7 @@ import queue
 import socket
 import struct
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -108,9 +108,9 @@ class Raw:
         self.send(1, b"VISNAVLK" + struct.pack("<II", 2, 0) + name)
         return self.receive()
 
-    def get_ready(self, pose_of: int = 0) -> None:
+    def get_ready(self, pose_of: int = 0, promises: bool = False) -> None:
         assert self.greet()[0] == 2
-        self.send(4, struct.pack("<II", pose_of, 0))
+        self.send(4, struct.pack("<II", pose_of, promises))
 
     def close(self) -> None:
         self.socket.close()
@@ -134,6 +134,14 @@ def pose(sequence: int, stamp: int, matrix: Any = None, status: int = 0) -> byte
     """The body of a POSE, as docs/reference/link.md has it."""
     rows = (np.eye(4) if matrix is None else np.asarray(matrix))[:3]
     return struct.pack("<QqIIII", sequence, stamp, status, 0, 0, 0) + rows.astype("<f8").tobytes()
+
+
+def stamped_poses(poses: Mapping[int, Any]) -> bytes:
+    """The body of a TRAJECTORY, as docs/reference/link.md has it, of poses by stamp."""
+    return b"".join(
+        struct.pack("<q12d", stamp, *np.asarray(matrix)[:3].ravel())
+        for stamp, matrix in poses.items()
+    )
 
 
 def compiled(source: Path, folder: Path, *flags: str) -> Path:

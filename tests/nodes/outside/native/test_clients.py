@@ -94,7 +94,11 @@ def test_frames_and_answers(mirror: list[str], tmp_path: Path) -> None:
             else:
                 assert answer.covariance is None
                 assert answer.points.shape == (0, 2)
-        run.endpoint.close()
+        trajectory = run.endpoint.finish(LIMIT)
+        assert trajectory.stamps.tolist() == [100 + n for n in range(10)]
+        assert origin is not None
+        expected = np.array([[n, 0, 0] for n in range(10)]) - origin
+        assert trajectory.poses[:, :3, 3].tolist() == expected.tolist()
         assert ended(process) == (0, "")
 
 

@@ -27,6 +27,7 @@ from tests.nodes.outside.native.samples_link import (
     listening,
     pose,
     program,
+    stamped_poses,
 )
 
 
@@ -252,6 +253,7 @@ def test_close_does_not_wait_for_a_program_that_reads_nothing(run: Noted) -> Non
         (33, b"", "DONE: expected 16 bytes, found 0"),
         (4, struct.pack("<II", 0, 0), "found type 4"),
         (17, b"", "found type 17"),
+        (36, b"", "a promised TRAJECTORY, LOG or BYE, found type 36"),
         (32, pose(0, 0, np.full((4, 4), np.inf)), "POSE.pose: expected finite"),
     ],
 )
@@ -291,6 +293,87 @@ def test_ready_names_whose_poses_come(run: Noted) -> None:
         assert raw.receive()[0] == 3
         with pytest.raises(LinkError, match=r"READY.pose_of: expected 0 or 1"):
             run.endpoint.wait(LIMIT)
+
+
+def test_ready_promises_a_trajectory_or_none(run: Noted) -> None:
+    with program(run.path) as raw:
+        assert raw.greet()[0] == 2
+        raw.send(4, struct.pack("<II", 0, 2))
+        with pytest.raises(LinkError, match=r"READY.trajectory: expected 0 or 1, found 2"):
+            run.endpoint.wait(LIMIT)
+    for promised in (False, True):
+        with program(run.path) as raw:
+            raw.get_ready(promises=promised)
+            run.endpoint.wait(LIMIT)
+            assert run.endpoint.promised == promised
+            raw.send(5)
+            run.reason()
+    assert not run.endpoint.promised
+    with pytest.raises(LinkError, match="expected a program with its trajectory, found none"):
+        run.endpoint.finish(LIMIT)
+
+
+@pytest.mark.parametrize("pose_of", [0, 1])
+@pytest.mark.parametrize("answered", [False, True])
+def test_the_trajectory_is_in_the_frame_of_the_poses_before_it(
+    run: Noted, pose_of: int, answered: bool
+) -> None:
+    """Or begins with the identity, if there are none."""
+    body_from_camera = pose_matrix(CAMERA.position, CAMERA.orientation)
+    cameras = [pose_matrix((n, 2, 3), (0.5, 0.5, 0.1 * n, 0.5)) for n in (4, 5, 6)]
+    said = [camera @ inverse(body_from_camera) if pose_of else camera for camera in cameras]
+    with program(run.path) as raw:
+        raw.get_ready(pose_of, promises=True)
+        run.endpoint.wait(LIMIT)
+        run.endpoint.send_frame(0, images())
+        raw.receive()
+        raw.send(*((32, pose(0, 0, said[1])) if answered else (33, struct.pack("<Qq", 0, 0))))
+        run.answer()
+        raw.send(36, stamped_poses({7: said[0], 8: said[2]}))
+        trajectory = run.endpoint.finish(LIMIT)
+        assert raw.receive() == (5, b"")
+    assert trajectory.stamps.tolist() == [7, 8]
+    origin = inverse(cameras[1 if answered else 0])
+    for found, camera in zip(trajectory.poses, (cameras[0], cameras[2]), strict=True):
+        assert found == pytest.approx(origin @ camera, abs=1e-12)
+    assert run.gone.empty()  # its end was expected
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (None, "none within 0.05 s"),
+        ((5, b"no map"), "it said goodbye no map"),
+        ((36, bytes(105)), "TRAJECTORY: expected 104 bytes a pose, found 105 in all"),
+    ],
+)
+def test_a_trajectory_that_does_not_come_is_an_error_with_the_reason(
+    run: Noted, message: tuple[int, bytes] | None, reason: str
+) -> None:
+    with program(run.path) as raw:
+        raw.get_ready(promises=True)
+        run.endpoint.wait(LIMIT)
+
+        def reply() -> None:
+            assert raw.receive() == (5, b"")
+            if message is not None:
+                raw.send(*message)
+
+        replying = threading.Thread(target=reply)
+        replying.start()
+        with pytest.raises(LinkError, match=f"raw: expected its trajectory, found {reason}"):
+            run.endpoint.finish(0.05 if message is None else LIMIT)
+        replying.join()
+    assert run.gone.empty()
+
+
+def test_a_second_trajectory_breaks_the_protocol(run: Noted) -> None:
+    with program(run.path) as raw:
+        raw.get_ready(promises=True)
+        run.endpoint.wait(LIMIT)
+        raw.send(36)
+        raw.send(36)
+        assert "TRAJECTORY: expected one, found a second" in run.reason()
 
 
 @pytest.mark.parametrize("of", [0, 1])

@@ -20,9 +20,17 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from nodes.outside.native import LinkError
-from nodes.outside.native.answers import read_done, read_order, read_pose
+from nodes.outside.native.answers import read_done, read_order, read_pose, read_trajectory
 from nodes.outside.native.client import RECORDS, Frame, Link, ProtocolError
-from tests.nodes.outside.native.samples_link import LIMIT, Raw, images, listening, pose, program
+from tests.nodes.outside.native.samples_link import (
+    LIMIT,
+    Raw,
+    images,
+    listening,
+    pose,
+    program,
+    stamped_poses,
+)
 
 ROOT = Path(__file__).parents[4]
 QUICK = settings(
@@ -124,17 +132,19 @@ def test_the_client_speaks_as_the_page_says(tmp_path: Path) -> None:
             raw.send(17, head + struct.pack("<IIIIIIQ", 1, 1, 2, 3, 6, 0, 64))
             sent.extend(raw.receive()[1] for _ in range(6))
             raw.send(5)
+            sent.append(raw.receive()[1])
 
     thread = threading.Thread(target=run)
     thread.start()
     with Link("näme", str(tmp_path / "s")) as link:
-        link.ready(pose_of="body")
+        link.ready(pose_of="body", trajectory=True)
         (frame,) = [frame for frame in link if _answer(link, frame)]
+        link.trajectory([5, 77], np.stack([np.eye(4), 2 * np.eye(4)]))
     thread.join()
     listener.close()
     os.close(fd)
     assert sent[0] == b"VISNAVLK\2\0\0\0\0\0\0\0" + "näme".encode()
-    assert sent[1] == struct.pack("<II", 1, 0)
+    assert sent[1] == struct.pack("<II", 1, 1)
     assert (frame.sequence, frame.stamp) == (0, 77)
     assert frame.image("mono8", camera=1).tolist() == [[0, 1, 2], [6, 7, 8]]
     assert [(batch.name, batch.arrived) for batch in frame.inputs] == [("imu", 9)]
@@ -144,7 +154,7 @@ def test_the_client_speaks_as_the_page_says(tmp_path: Path) -> None:
     with pytest.raises(LookupError, match="expected one of imu, found 'gnss'"):
         frame.rows("gnss")
 
-    further, order, full, lost, done, log = sent[2:]
+    further, order, full, lost, done, log, trajectory = sent[2:]
     assert struct.unpack_from("<QqIIII", further) == (0, 77, 0, 0, 0, 1)
     assert struct.unpack("<QqII8d", order) == (0, 77, 3, 1, 0, 0, 0, 1, 2, 3, 0, 0.5)
     assert struct.unpack_from("<QqIIII", full) == (0, 77, 0, 3, 2, 0)
@@ -157,6 +167,9 @@ def test_the_client_speaks_as_the_page_says(tmp_path: Path) -> None:
     assert len(lost) == 128
     assert done == struct.pack("<Qq", 0, 77)
     assert log == "grüße".encode()
+    assert len(trajectory) == 2 * 104
+    assert struct.unpack_from("<q12d", trajectory) == (5, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0)
+    assert struct.unpack_from("<q12d", trajectory, 104) == (77, 2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0)
 
 
 def _answer(link: Link, frame: Any) -> bool:
@@ -215,6 +228,31 @@ def test_an_answer_that_is_changed_anywhere_is_read_or_named(data: st.DataObject
 def test_what_is_wrong_is_named(body: bytes, named: str) -> None:
     with pytest.raises(LinkError, match=named.replace("+", r"\+")):
         read_pose(bytearray(body))
+
+
+@pytest.mark.parametrize(
+    ("body", "named"),
+    [
+        (bytes(103), "TRAJECTORY: expected 104 bytes a pose, found 103 in all"),
+        (stamped_poses({5: np.eye(4), 4: np.eye(4)}), "rise strictly, found 4 after 5"),
+        (stamped_poses({4: np.eye(4)}) * 2, "rise strictly, found 4 after 4"),
+        (stamped_poses({4: np.eye(4), 5: np.full((4, 4), np.inf)}), "pose: expected finite"),
+        (stamped_poses({4: np.eye(4), 5: np.zeros((4, 4))}), "pose: expected a rotation"),
+        (stamped_poses({4: np.full((4, 4), 1e10), 5: np.eye(4)}), "pose: expected at most"),
+    ],
+)
+def test_a_wrong_trajectory_is_named(body: bytes, named: str) -> None:
+    with pytest.raises(LinkError, match=rf"TRAJECTORY.*{named}" if named[0].islower() else named):
+        read_trajectory(bytearray(body))
+
+
+@QUICK
+@given(st.binary(max_size=3 * 104))
+def test_no_body_of_a_trajectory_breaks_the_reader(body: bytes) -> None:
+    with contextlib.suppress(LinkError):
+        stamps, poses = read_trajectory(bytearray(body))
+        assert poses.shape == (len(stamps), 4, 4)
+        assert np.isfinite(poses).all()
 
 
 def test_a_lost_pose_may_hold_anything() -> None:

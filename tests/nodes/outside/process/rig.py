@@ -46,6 +46,7 @@ class EyesConfig(NodeConfig):
     leaves_out: tuple[int, ...] = ()
     inertial: bool = True
     truth: bool = False
+    time_offset: float = 0.0
 
 
 class Eyes(Node[EyesConfig]):
@@ -66,6 +67,7 @@ class Eyes(Node[EyesConfig]):
                 info=CameraInfo.from_fov(WIDTH, HEIGHT, math.pi / 2),
                 rate=self.config.rate,
                 latency=0.0,
+                time_offset=self.config.time_offset,
                 frame_id=f"{name}_optical",
                 position=(0.2, 0.1 * number, 0.0),
                 orientation=LOOKING_AHEAD,

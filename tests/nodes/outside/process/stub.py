@@ -44,10 +44,12 @@ def main() -> None:
     if "early" in modes:
         sys.exit("no vocabulary")
     held: list[Frame] = []
+    stamps: list[int] = []
     with Link("stub") as link:
-        link.ready("body" if "sure" in modes else "camera")
+        link.ready("body" if "sure" in modes else "camera", "corrects" in modes)
         for frame in link:
             number = frame.sequence
+            stamps.append(frame.stamp)
             if "log" in modes:
                 imu = frame.rows("imu")
                 link.log(f"imu {len(imu)} {imu['stamp'].tolist()}")
@@ -105,6 +107,14 @@ def main() -> None:
                 link.pose(frame, pose_of(frame))
                 if "twice" in modes:
                     link.pose(frame, pose_of(frame) * 2 - np.eye(4))
+        if (
+            modes.get("corrects") == "well"
+        ):  # the first at (0, 0, 1), then one step each to the right
+            poses = np.tile(np.eye(4), (len(stamps), 1, 1))
+            poses[:, 0, 3], poses[:, 2, 3] = np.arange(len(stamps)), 1.0
+            link.trajectory(stamps, poses)
+        elif modes.get("corrects") == "empty":
+            link.trajectory([], np.empty((0, 4, 4)))
     if "deaf" in modes:
         time.sleep(600)
     if "fails" in modes:

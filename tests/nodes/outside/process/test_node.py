@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from events import PoseEstimate
+from events import PoseEstimate, TrajectoryEstimate
 from nodes.judging.evaluation import Evaluation
 from nodes.ros2.bridge import Ros2Bridge
 from runtime import Node, NodeConfig, on
@@ -110,10 +110,15 @@ class Ear(Node[NodeConfig]):
     """Keeps what is estimated."""
 
     poses: ClassVar[list[PoseEstimate]] = []
+    trajectories: ClassVar[list[TrajectoryEstimate]] = []
 
     @on(PoseEstimate)
     def estimates(self, event: PoseEstimate) -> None:
         self.poses.append(event)
+
+    @on(TrajectoryEstimate)
+    def corrected(self, event: TrajectoryEstimate) -> None:
+        self.trajectories.append(event)
 
 
 @pytest.mark.slow
@@ -129,6 +134,62 @@ def test_covariance_and_velocity_reach_the_estimates_turned_as_the_poses_are(
         assert pose.velocity == pytest.approx((0.2, -0.1, 0.3))
         expected = np.diag([2.0, 1, 3, 5, 4, 6]) * 1e-4
         assert np.reshape(pose.covariance, (6, 6)) == pytest.approx(expected, abs=1e-15)
+
+
+def corrected(out: Path, correction: str, **settings: Any) -> list[TrajectoryEstimate]:
+    """Return the final trajectories of a program that promises one."""
+    Ear.poses.clear()
+    Ear.trajectories.clear()
+    eyes = {"time_offset": settings.pop("time_offset", 0.0)}
+    fly(program(f"corrects={correction}", **settings), out, 0.2, others=(spec(Ear, "ear"),), **eyes)
+    return Ear.trajectories
+
+
+@pytest.mark.parametrize("time_offset", [0.0, pytest.param(0.004, marks=pytest.mark.slow)])
+def test_its_final_trajectory_has_stamps_and_frame_of_its_poses(
+    time_offset: float, tmp_path: Path
+) -> None:
+    """Of all frames that it got, a metre ahead and each a metre further to the right."""
+    (final,) = corrected(tmp_path, "well", time_offset=time_offset, latency=0.001)
+    assert final.frame_id == "map"
+    assert final.stamps.tolist() == [pose.stamp for pose in Ear.poses]
+    assert len(final.stamps) == 6
+    expected = [[2.0, 2.0 + n, -0.1] for n in range(6)]
+    assert final.positions == pytest.approx(np.array(expected), abs=1e-12)
+
+
+@pytest.mark.slow
+def test_frames_that_wait_for_a_slow_program_are_in_its_trajectory(tmp_path: Path) -> None:
+    """Answers to the last three are due after the end of the run."""
+    (final,) = corrected(tmp_path, "well", latency=0.1)
+    assert len(Ear.poses) < 6
+    assert len(final.stamps) == 6
+
+
+@pytest.mark.slow
+def test_a_trajectory_alone_starts_where_the_vehicle_was_then(tmp_path: Path) -> None:
+    (final,) = corrected(
+        tmp_path, "well", command=[sys.executable, STUB, "corrects=well", "starts=99"]
+    )
+    assert Ear.poses == []
+    assert final.positions[:2].tolist() == [[1.0, 2.0, -0.1], [1.0, 3.0, -0.1]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", ["error", "continue"])
+def test_a_promised_trajectory_that_does_not_come_ends_in_an_error_or_a_warning(
+    policy: str, tmp_path: Path
+) -> None:
+    missing = "stub: expected its trajectory, found it said goodbye"
+    with pytest.raises(VisnavError, match=missing) if policy == "error" else nullcontext():
+        assert corrected(tmp_path, "never", hold={"on_missing": policy}) == []
+    assert missing in (tmp_path / "log.txt").read_text()
+
+
+@pytest.mark.slow
+def test_an_empty_trajectory_is_a_warning(tmp_path: Path) -> None:
+    assert corrected(tmp_path, "empty") == []
+    assert "its final trajectory is empty" in (tmp_path / "log.txt").read_text()
 
 
 @pytest.mark.slow

@@ -383,8 +383,13 @@ def test_who_says_too_little_is_lost(
 
 def test_a_final_map_of_a_part_of_the_images_has_failed() -> None:
     study = read_study()
-    final, said = (next(s for s in study.systems if s.final is kind) for kind in (True, False))
+    final_map, keyframes, streamed = (
+        next(system for system in study.systems if system.final == kind)
+        for kind in ("map", "keyframes", "")
+    )
     part = result(final_ate_m=0.01, final_percent=30.0, coverage_percent=90.0)
-    assert part.failed(final, study)
-    assert not part.failed(said, study)
-    assert (part.error_m(final), part.error_m(said)) == (0.01, 0.1)
+    assert part.failed(final_map, study)
+    assert not part.failed(keyframes, study)
+    assert not part.failed(streamed, study)
+    errors = [part.error_m(system) for system in (final_map, keyframes, streamed)]
+    assert errors == [0.01, 0.01, 0.1]
