@@ -186,12 +186,11 @@ def levels(simulated: Simulated, published: Published) -> dict[tuple[str, Cell],
 def failing(errors: Mapping[str, float]) -> dict[str, bool]:
     """Return in which sequences a system fails: none, or more than 5 times its own median.
 
-    Empty with fewer than three sequences, as their median has no meaning.
+    With fewer than three sequences, whose median has no meaning, only where there is none.
     """
-    if len(errors) < LEAST_SEQUENCES:
-        return {}
-    middle = float(np.median([*errors.values()]))
-    return {name: math.isinf(error) or error > FAILED * middle for name, error in errors.items()}
+    enough = len(errors) >= LEAST_SEQUENCES
+    limit = FAILED * float(np.median([*errors.values()])) if enough else math.inf
+    return {name: math.isinf(error) or error > limit for name, error in errors.items()}
 
 
 class Failures(msgspec.Struct, frozen=True, kw_only=True):

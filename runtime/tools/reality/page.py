@@ -287,15 +287,22 @@ def write_page(
     errors = {name: real[s.published] for name, s in systems.items() if s.published}
     table = groups(study, count)
     simulated = {name: {c: g.error for c, g in row.items()} for name, row in table.items()}
-    counted = {name: row for name, row in simulated.items() if not systems[name].why_not}
+    of_systems = {name: row for name, row in simulated.items() if not systems[name].why_not}
+    left_out = {world.name for world in study.worlds if world.why_not}
+    counted = {
+        name: {cell: error for cell, error in row.items() if cell.world not in left_out}
+        for name, row in of_systems.items()
+    }
     folder = path.parent / path.stem.lower()
     folder.mkdir(parents=True, exist_ok=True)
     labels = {name: systems[name].published for name in counted}
     worlds = [world.name for world in study.worlds]
-    drawn = draw(counted, errors, labels, worlds, folder / "scatter.svg")
+    drawn = draw(of_systems, errors, labels, worlds, folder / "scatter.svg")
     flown = [w for w in worlds if any(c.world == w for row in table.values() for c in row)]
     all_criteria = agreement.criteria(counted, errors)
-    criteria_by_world = [agreement.criteria(_in_world(counted, world), errors) for world in flown]
+    criteria_by_world = [
+        agreement.criteria(_in_world(of_systems, world), errors) for world in flown
+    ]
     text = template(FOLDER / "REALITY.md.jinja").render(
         command=command,
         study=study,
@@ -305,7 +312,7 @@ def write_page(
         flown=flown,
         by_world=[(c[0].name, c[1:]) for c in zip(all_criteria, *criteria_by_world, strict=True)],
         inverted=agreement.inversions(counted, errors)[0],
-        rankings=agreement.rankings(counted, errors),
+        rankings=agreement.rankings(of_systems, errors),
         levels=agreement.levels(counted, errors),
         systems=systems,
         counted=counted,

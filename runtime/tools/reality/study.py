@@ -55,6 +55,7 @@ class Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         worlds: Worlds flown in with it; all if empty.
         seeds: Flights of a sequence, if not that of the command.
         scan: Whether it is the world given by ``--outside``.
+        why_not: Why results in this world are reported and not counted; empty if they are counted.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     worlds: tuple[str, ...] = ()
     seeds: int = 0
     scan: bool = False
+    why_not: str = ""
 
 
 class System(Entrant, frozen=True, kw_only=True, forbid_unknown_fields=True):

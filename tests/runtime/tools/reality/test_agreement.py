@@ -164,7 +164,8 @@ def test_a_failure_is_none_or_far_beyond_the_systems_own_median() -> None:
     assert failing({"1": 0.1, "2": 0.1, "3": 0.51, "4": math.inf, "5": 0.1}) == {
         "1": False, "2": False, "3": True, "4": True, "5": False
     }  # fmt: skip
-    assert failing({"1": 0.1, "2": math.inf}) == {}
+    assert failing({"1": 0.1, "2": math.inf}) == {"1": False, "2": True}
+    assert failing({"1": 0.1, "2": 9.0}) == {"1": False, "2": False}
 
 
 def test_failures_of_both_sides_by_hand() -> None:

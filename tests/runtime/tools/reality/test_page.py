@@ -133,6 +133,25 @@ def test_a_condition_may_be_flown_with_some_systems(study: Study, tmp_path: Path
     assert "| basalt | × " not in text
 
 
+def test_a_world_that_is_not_counted_is_shown_with_the_reason(study: Study, tmp_path: Path) -> None:
+    """Nothing agrees in it; what counts does not change."""
+    first, *others = study.worlds
+    left_out = msgspec.structs.replace(first, why_not="it is unlike the real rooms")
+    apart = msgspec.structs.replace(study, worlds=(left_out, *others))
+    count = made_up(study)
+    for run, result in count.items():
+        if run.world == first.name:
+            count[run] = changed(result, ate_m=100.0 / (result.ate_m or 1.0), final_ate_m=None)
+    text = page(apart, count, tmp_path)
+    by_all = r"\| ranking of systems \| Spearman 1\.00, .* passed \|"
+    assert re.search(by_all, text)
+    assert not re.search(by_all, page(study, count, tmp_path / "all"))
+    assert "over all worlds that count." in text
+    heading = f"## {first.name}: {first.shows}\n\n**Reported, not counted**: it is unlike the real"
+    assert heading in text
+    assert re.search(r"\| level \| .*: failed \| 1 in the median of \d+: passed \|", text)
+
+
 def test_what_went_wrong_is_on_the_page(study: Study, tmp_path: Path) -> None:
     """Crashes, silence, stale results, and flights of different bytes."""
     count = made_up(study, flight="f")
