@@ -353,10 +353,10 @@ class SimulatorConfig(NodeConfig):
 
     Attributes:
         world: Built-in world (``hall``, ``yard``, ``corridor``, ``office``, ``night``, ``forest``,
-            ``field``) or path of an MJCF or mesh file (.glb, .gltf, .obj, .ply, .stl, .dae, a
-            Gazebo .world or .sdf); empty for the other vehicles', or ``hall``. In MJCF x is north,
-            y west, z up; in all settings and events x is north, y east, z down (NED): ``pos="1 2
-            3"`` is (1, -2, -3) in ``map``.
+            ``field``, ``mocap``) or path of an MJCF or mesh file (.glb, .gltf, .obj, .ply, .stl,
+            .dae, a Gazebo .world or .sdf); empty for the other vehicles', or ``hall``. In MJCF x is
+            north, y west, z up; in all settings and events x is north, y east, z down (NED):
+            ``pos="1 2 3"`` is (1, -2, -3) in ``map``.
         mesh: How the world is made of a mesh file; of the node that names the world.
         origin: Where the origin of ``map`` is on the earth: latitude and longitude, degrees north
             and east, and altitude, metres above the WGS 84 ellipsoid, which here is sea level too.

@@ -27,6 +27,7 @@ from sims.worlds.field import field
 from sims.worlds.forest import forest
 from sims.worlds.hall import hall
 from sims.worlds.indoors import corridor, office
+from sims.worlds.mocap import mocap
 from sims.worlds.yard import night, yard
 
 __all__ = [
@@ -42,6 +43,7 @@ WORLDS: dict[str, Callable[[int, bool], mujoco.MjSpec | Scene]] = {
     "night": night,
     "forest": forest,
     "field": field,
+    "mocap": mocap,
 }  # built-in worlds by name: functions of a seed and `bare`; a `Scene` if parts move by themselves
 
 
