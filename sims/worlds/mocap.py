@@ -10,6 +10,7 @@ floor. What lies flat (strips, play mats, paper, cables) is painted on the floor
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -19,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sims.worlds import decals, materials
-from sims.worlds.builder import Builder, Material, sides
+from sims.worlds.builder import WHOLE, Builder, Material, sides
 from sims.worlds.materials import Canvas, Colour, Image, mix, shade, share, smooth, to_bytes
 
 NORTH, WEST, HEIGHT = 4.0, 4.2, 4.0
@@ -116,12 +117,13 @@ def _mats(b: Builder) -> None:
         _lean(b, f"mat_{number}", material, mat, decals.tile(number % 6, 3, 2))
     x, y, *size, high = STACK
     layers = b.material("stack", _layers, (int(1.0 * CLOTH_DENSITY), shape[0]), CLOTH_DENSITY)
-    whole = dict.fromkeys(("front", "left", "back", "right", "top"), (0.0, 0.0, 1.0, 1.0))
+    whole = dict.fromkeys(("front", "left", "back", "right", "top"), WHOLE)
     lid = b.random.uniform(0.06, 0.08)
     b.box("stack", layers, (size[0], size[1], high - 0.14), (x, y, 0.0), windows=whole,
           hidden=("bottom", "top"))  # fmt: skip
-    b.box("stack_top", wide, (size[0] + 0.05, size[1] + 0.05, 0.14), (x - lid, y + lid, high - 0.14),
-          windows={"top": decals.tile(1, 3, 2)}, hidden=())  # fmt: skip
+    b.box("stack_top", wide, (size[0] + 0.05, size[1] + 0.05, 0.14),
+          (x - lid, y + lid, high - 0.14), windows={"top": decals.tile(1, 3, 2)},
+          hidden=())  # fmt: skip
     x, y, *size, high = LYING
     b.box("lying", wide, (size[0], size[1], high), (x, y, 0.0), turn=4.0,
           windows={"top": decals.tile(4, 3, 2)})  # fmt: skip
@@ -141,7 +143,7 @@ def _prints(b: Builder, dark: Material) -> None:
     b.box("case", dark, (0.26, 0.48, 0.3), (0.6, -3.4, 0.4), turn=12.0)
     b.box("case_handle", dark, (0.05, 0.24, 0.06), (0.6, -3.4, 0.7), turn=12.0)
     wood = b.material("drape", _drape, (int(2.4 * 128), int(2.6 * 128)), 128.0)
-    b.panel("drape", wood, (0.0, 0.0, 1.0, 1.0), (2.6, 2.4), (-3.93, 1.05, 1.75), 0.0)
+    b.panel("drape", wood, WHOLE, (2.6, 2.4), (-3.93, 1.05, 1.75), 0.0)
     for number, (y, z) in enumerate(((2.0, 2.65), (0.3, 2.75), (-2.1, 2.3))):
         b.panel(f"marker_{number}", boards, decals.tile(3, 2, 2), (0.22, 0.22), (-3.92, y, z), 0.0)
     b.panel("poster", boards, decals.tile(1, 2, 2), (0.6, 0.6), (-1.6, 4.18, 1.7), -90.0)
@@ -155,7 +157,9 @@ def _fixtures(b: Builder, dark: Material, steel: Material) -> None:
     for number, x in enumerate((-1.85, -1.2)):
         b.box(f"screen_{number}", dark, (0.56, 0.04, 0.36), (x, -3.9, 0.86), hidden=())
     b.box("computer", dark, (0.22, 0.5, 0.5), (-1.9, -3.8, 0.0))
-    b.box("rack", dark, (1.0, 0.5, 1.05), (-1.9, 3.85, 0.0))
+    shelf = b.material("rack", _rack, (168, 160), 160.0)
+    whole = dict.fromkeys(("front", "left", "back", "right"), WHOLE)
+    b.box("rack", shelf, (1.0, 0.5, 1.05), (-1.9, 3.85, 0.0), windows=whole)
     b.box("partition", steel, (1.1, 0.05, 1.9), (-0.95, 3.95, 0.0), turn=-6.0)
     for number, y in enumerate((-0.2, 0.2)):
         b.box(f"ladder/rail_{number}", steel, (0.03, 0.07, 2.6), (0.55 + y, -3.85, 1.3), tilt=0.01)
@@ -178,7 +182,7 @@ def _fixtures(b: Builder, dark: Material, steel: Material) -> None:
 def _openings(b: Builder) -> None:
     pane = b.material("window", _window, (int(1.9 * 96), int(1.9 * 96)), 96.0, glow=0.75)
     for number, (x, y, facing) in enumerate(WINDOWS):
-        b.panel(f"window_{number}", pane, (0.0, 0.0, 1.0, 1.0), (1.9, 1.9), (x, y, 2.2), facing)
+        b.panel(f"window_{number}", pane, WHOLE, (1.9, 1.9), (x, y, 2.2), facing)
 
 
 def _shell(b: Builder) -> None:
@@ -280,7 +284,7 @@ def _boards(on: Canvas) -> Image:
 
 
 def _boxes(on: Canvas) -> Image:
-    """Return four boxes' sides in rows of two: white with stripes, brown, white with text, a case."""
+    """Return four boxes' sides in rows of two: striped, brown, white, black."""
     height, width = on.shape
     faces = []
     for kind, colour in enumerate(
@@ -306,13 +310,26 @@ def _boxes(on: Canvas) -> Image:
     return decals.sheets(faces, 2)
 
 
+def _rack(on: Canvas) -> Image:
+    """Return a black rack of devices: rows of holes, lamps and plugs."""
+    rack = to_bytes(materials.paint(on, (0.09, 0.09, 0.10), grain=0.02))
+    height, width = on.shape
+    for top in range(8, height - 12, 20):
+        cv2.rectangle(rack, (6, top), (width - 7, top + 14), (40, 41, 44), 1)
+        for x in range(14, width - 14, 12):
+            if on.random.uniform() < 0.6:
+                tone = int(on.random.integers(90, 230))
+                cv2.circle(rack, (x, top + 7), int(on.random.integers(1, 4)), (tone,) * 3, -1)
+    return share(rack)
+
+
 def _drape(on: Canvas) -> Image:
     """Return a curtain printed with rough upright boards, worn pale in streaks."""
     boards = materials.upright(on, width=0.17, palette=(
         (0.42, 0.40, 0.37), (0.34, 0.32, 0.30), (0.50, 0.47, 0.43), (0.29, 0.28, 0.26),
     ))  # fmt: skip
-    streaks = on.fractal(coarse=0.06 * on.density, fine=2, stretch=(9.0, 1.0), gain=0.9)
-    boards = mix(boards, (0.86, 0.84, 0.80), smooth(0.9, 2.2, streaks) * 0.8)
+    streaks = on.fractal(coarse=0.08 * on.density, fine=2, stretch=(4.0, 1.0), gain=1.0)
+    boards = mix(boards, (0.86, 0.84, 0.80), smooth(0.7, 1.9, streaks) * 0.85)
     boards = mix(boards, (0.12, 0.11, 0.10), smooth(1.0, 2.4, -streaks) * 0.7)
     across = np.arange(on.shape[1], dtype=np.float32) / on.density
     hang = np.sin(across * np.float32(2.0 * math.pi / 0.42)) * np.float32(0.08)
@@ -341,8 +358,8 @@ def _wall(on: Canvas, door: float | None) -> Image:
     wall = on.flat((0.93, 0.93, 0.92))
     wall = shade(wall, 0.015 * on.fractal(coarse=on.density, fine=3, gain=0.9))
     low = smooth(0.0, 1.0, np.arange(height, dtype=np.float32)[:, None] / height - 0.35)
-    scuffs = on.specks(count=int(6 * on.area), radius=(1.0, 6.0))
-    wall = shade(wall, -0.14 * np.maximum(scuffs, 0.0) * low)
+    scuffs = on.specks(count=int(14 * on.area), radius=(1.0, 5.0))
+    wall = shade(wall, -0.22 * np.maximum(scuffs, 0.0) * low)
     wall[-10:] = (0.52, 0.52, 0.51)
     wall[-11] *= 0.7
     at = int(0.62 * width)
@@ -378,7 +395,7 @@ Bytes = npt.NDArray[np.uint8]
 
 
 class Sheet:
-    """A piece of the floor to print on: its points are metres ahead and to the left of its middle."""
+    """A piece of the floor to print on; points are metres ahead and to the left of its middle."""
 
     SHIFT = 4  # bits of a pixel's fraction in OpenCV's coordinates
 
@@ -401,7 +418,7 @@ class Sheet:
         """Fill a rectangle about a point."""
         a, b = size[0] / 2.0, size[1] / 2.0
         corners = np.array(((a, b), (a, -b), (-a, -b), (-a, b)))
-        self.area(corners + (ahead, left), colour)
+        self.area(corners + np.array((ahead, left)), colour)
 
     def line(self, points: Any, width: float, colour: Sequence[int], closed: bool = False) -> None:
         """Draw a line, `width` in metres."""
@@ -437,7 +454,7 @@ def _strip(sheet: Sheet, random: np.random.Generator, long: float) -> None:
     """Draw a black strip with white confetti, taped down at its ends."""
     wide = 0.17
     sheet.box(0.0, 0.0, (long, wide), (24, 24, 25))
-    for _ in range(int(long * 26)):
+    for _ in range(int(long * 34)):
         ahead, left = random.uniform(-0.5, 0.5, 2) * (long - 0.06, wide - 0.05)
         shape = random.uniform(0.012, 0.034, (4, 1)) * ((1, 1), (1, -1), (-1, -1), (-1, 1))
         sheet.area(shape * random.uniform(0.4, 1.0, 2) + (ahead, left), (232, 232, 230))
@@ -467,9 +484,9 @@ def _play_mat(sheet: Sheet, random: np.random.Generator, long: float, wide: floa
         for points, closed in streets:
             sheet.line(points, width, colour, closed)
     for points, _ in streets:
-        for start, end in zip(points[:-1:1], points[1::1], strict=True):
+        for start, end in itertools.pairwise(points):
             sheet.line((start, start + 0.5 * (end - start)), 0.006, (240, 240, 236))
-    for _ in range(int(long * wide * 22)):
+    for _ in range(int(long * wide * 34)):
         ahead, left = random.uniform(-0.9, 0.9, 2) * half
         kind = int(random.integers(4))
         colour = ((196, 70, 60), (60, 92, 160), (226, 190, 80), (70, 60, 56))[
@@ -497,7 +514,7 @@ def _scraps(floor: Bytes, random: np.random.Generator) -> None:
         turns = np.radians(heading) + np.cumsum(random.normal(0.0, 0.22, 60))
         steps = np.stack([np.cos(turns), np.sin(turns)], 1) * 0.06
         Sheet(floor, x, y, 0.0).line(np.cumsum(steps, 0), 0.012, (30, 30, 32))
-    for number in range(150):
+    for number in range(240):
         near = number % 3 == 0
         x, y = (
             random.normal((-1.8, -2.2), 0.7) if near else random.uniform((-3.7, -3.9), (3.7, 3.9))
