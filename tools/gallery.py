@@ -30,6 +30,7 @@ VIEWS = {  # north, east, down, metres; roll, pitch, yaw, degrees
     "night": (4.0, 2.0, -1.7, 0, 2, 40),
     "forest": (-6.0, 6.4, -1.6, 0, 0, -60),
     "field": (-14.0, -1.5, -3.5, 0, -8, 15),
+    "mocap": (-2.3, -1.6, -1.9, 0, -12, 38),
 }
 
 

@@ -161,8 +161,8 @@ def _fixtures(b: Builder, dark: Material, steel: Material) -> None:
     whole = dict.fromkeys(("front", "left", "back", "right"), WHOLE)
     b.box("rack", shelf, (1.0, 0.5, 1.05), (-1.9, 3.85, 0.0), windows=whole)
     b.box("partition", steel, (1.1, 0.05, 1.9), (-0.95, 3.95, 0.0), turn=-6.0)
-    for number, y in enumerate((-0.2, 0.2)):
-        b.box(f"ladder/rail_{number}", steel, (0.03, 0.07, 2.6), (0.55 + y, -3.85, 1.3), tilt=0.01)
+    for number, x in enumerate((0.35, 0.75)):
+        b.box(f"ladder/rail_{number}", steel, (0.03, 0.07, 2.6), (x, -3.85, 0.0))
     for number, z in enumerate(np.arange(0.3, 2.5, 0.28).tolist()):
         b.box(f"ladder/rung_{number}", steel, (0.4, 0.07, 0.04), (0.55, -3.85, z), hidden=())
     for number, turn in enumerate((10.0, 130.0, 250.0)):
@@ -331,9 +331,9 @@ def _drape(on: Canvas) -> Image:
     streaks = on.fractal(coarse=0.08 * on.density, fine=2, stretch=(4.0, 1.0), gain=1.0)
     boards = mix(boards, (0.86, 0.84, 0.80), smooth(0.7, 1.9, streaks) * 0.85)
     boards = mix(boards, (0.12, 0.11, 0.10), smooth(1.0, 2.4, -streaks) * 0.7)
-    across = np.arange(on.shape[1], dtype=np.float32) / on.density
-    hang = np.sin(across * np.float32(2.0 * math.pi / 0.42)) * np.float32(0.08)
-    return shade(boards, np.broadcast_to(hang, on.shape).astype(np.float32))
+    turn = 2.0 * math.pi / (0.42 * on.density)  # of the hanging cloth's waves, a column
+    hang = np.array([0.08 * math.sin(turn * k) for k in range(on.shape[1])], np.float32)
+    return shade(boards, np.broadcast_to(hang, on.shape))
 
 
 def _window(on: Canvas) -> Image:

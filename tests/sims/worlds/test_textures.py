@@ -20,7 +20,7 @@ SAVED: dict[str, dict[str, str]] = json.loads(
 )
 """Hashes of each world's textures, and of its model, as they were with one generator for all."""
 
-QUICK = ("hall", "corridor", "office")
+QUICK = ("hall", "corridor", "office", "mocap")
 EACH = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in WORLDS]
 
 

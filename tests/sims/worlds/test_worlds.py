@@ -61,7 +61,7 @@ class Probe:
         )
 
 
-QUICK = ("hall", "corridor", "office")
+QUICK = ("hall", "corridor", "office", "mocap")
 """Worlds whose textures are drawn in a moment, or in every run anyway."""
 
 EACH = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in WORLDS]
@@ -317,6 +317,38 @@ def test_opposite_places_of_the_corridor_look_alike() -> None:
         assert image.std() > 20.0
 
 
+def test_the_middle_of_the_motion_capture_room_is_free() -> None:
+    """Nothing from 0.3 to 3.2 m above the floor within 2.6 m of the middle; some at 3 m."""
+    for radius, free in ((2.6, True), (3.0, False)):
+        world = load_world("mocap", bare=True)
+        world.worldbody.add_geom(
+            name="middle", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[radius, 1.45, 0],
+            pos=[0.0, 0.0, 1.75],
+        )  # fmt: skip
+        model: Any = world.compile()
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        middle = model.geom("middle").id
+        solids = [int(k) for k in np.flatnonzero(model.geom_contype) if k != middle]
+        near = [
+            model.geom(solid).name
+            for solid in solids
+            if mujoco.mj_geomDistance(model, data, middle, solid, 1.0, None) <= 0.0
+        ]
+        assert (not near) == free, near
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_the_motion_capture_room_is_between_office_and_hall() -> None:
+    """Five times the office's strong corners, fewer than the hall's; walls brighter than cloth."""
+    images = {n: greys(n, places(n, 12)) for n in ("hall", "office", "mocap")}
+    count = {n: statistics.median(corners(image) for image in images[n]) for n in images}
+    assert 5 * count["office"] < count["mocap"] < 0.8 * count["hall"]
+    spread = {n: statistics.median(float(image.std()) for image in images[n]) for n in images}
+    assert spread["mocap"] > 1.3 * spread["hall"]
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_office_shows_few_corners_and_the_night_is_dark() -> None:
@@ -352,7 +384,7 @@ def test_leaves_and_shadows_move_as_a_pure_function_of_time() -> None:
 @pytest.mark.timeout(300)
 def test_they_cost_at_most_twice_as_much_as_the_others() -> None:
     """Processor time of colour and depth at 512 x 512, outdoors against the yard, else the hall."""
-    built = {name: scene(name) for name in ("hall", "yard", "field", *HARD)}
+    built = {name: scene(name) for name in ("hall", "yard", "field", "mocap", *HARD)}
     renderers = {
         name: CameraRenderer(world.packed, CAMERAS, world.prefix, seed=0)
         for name, world in built.items()
@@ -374,6 +406,7 @@ def test_they_cost_at_most_twice_as_much_as_the_others() -> None:
         usual = "yard" if name in ("night", "forest") else "hall"
         assert medians[name] < 2.0 * medians[usual], name
     assert medians["field"] < 1.2 * medians["yard"]
+    assert medians["mocap"] < 1.2 * medians["hall"]
     for renderer in renderers.values():
         renderer.close()
 
