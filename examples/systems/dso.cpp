@@ -2,7 +2,7 @@
 //
 // It answers with the pose of the camera in DSO's world, whose unit of length is arbitrary, and at the end
 // gives those of the keyframes after all optimizations, which DSO itself writes as its result. All is
-// computed in the caller's thread, one frame after the other. The argument is DSO's own: `mode=2`, if
+// computed in the caller's thread, one frame after the other. Images of a lens are rectified. The argument is DSO's own: `mode=2`, if
 // there is none, takes images as perfect (one exposure, no vignette, little noise); `mode=1` is for cameras
 // without photometric calibration, as EuRoC's, and estimates the brightness of each frame.
 #define BOOST_BIND_GLOBAL_PLACEHOLDERS  // which DSO's headers use
@@ -16,6 +16,8 @@
 #include <util/globalCalib.h>
 #include <util/settings.h>
 
+#include <algorithm>
+#include <array>
 #include <iostream>
 #include <map>
 #include <memory>
@@ -66,9 +68,47 @@ struct System {
     EIGEN_MAKE_ALIGNED_OPERATOR_NEW
 };
 
+// Makes pinhole images of those of a radial-tangential lens, with the same matrix, as DSO's own tools do
+// before it sees an image: what the calibration errs by stays in them.
+class Rectification {
+public:
+    explicit Rectification(const visnav::Camera& camera)
+        : width_(camera.width), height_(camera.height) {
+        if (camera.distortion_model != "plumb_bob")
+            throw visnav::Error("expected the lens plumb_bob, found " + camera.distortion_model);
+        std::array<double, 5> k{};
+        std::copy_n(camera.distortion.begin(), std::min<std::size_t>(k.size(), camera.distortion.size()), k.begin());
+        for (int v = 0; v < height_; ++v)
+            for (int u = 0; u < width_; ++u) {
+                const double x = (u - camera.cx) / camera.fx, y = (v - camera.cy) / camera.fy;
+                const double r2 = x * x + y * y, radial = 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]));
+                const double at_x = x * radial + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x);
+                const double at_y = y * radial + k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y;
+                places_.push_back({inside(camera.fx * at_x + camera.cx, width_),
+                                   inside(camera.fy * at_y + camera.cy, height_)});
+            }
+    }
+    // Bilinear; what lies beyond the image's edge is its edge.
+    void rectify(const visnav::Image& from, float* to) const {
+        for (const auto& [u, v] : places_) {
+            const int column = static_cast<int>(u), row = static_cast<int>(v);
+            const float across = u - float(column), down = v - float(row);
+            const std::uint8_t *above = from.row<std::uint8_t>(row) + column,
+                               *below = from.row<std::uint8_t>(row + 1) + column;
+            *to++ = (1 - down) * ((1 - across) * above[0] + across * above[1]) +
+                    down * ((1 - across) * below[0] + across * below[1]);
+        }
+    }
+
+private:
+    static float inside(double at, int size) {
+        return static_cast<float>(std::min(std::max(at, 0.0), size - 1.001));
+    }
+    int width_, height_;
+    std::vector<std::array<float, 2>> places_;
+};
+
 void configure(const visnav::Camera& camera, bool perfect) {
-    for (double each : camera.distortion)
-        if (each != 0.0) throw visnav::Error("expected a camera without distortion");
     dso::setting_photometricCalibration = 0;
     dso::setting_affineOptModeA = dso::setting_affineOptModeB = perfect ? -1 : 0;
     if (perfect) dso::setting_minGradHistAdd = 3;
@@ -90,14 +130,13 @@ int main(int argc, char** argv) try {
     visnav::Link link("DSO");
     const visnav::Camera camera = link.camera(0);
     configure(camera, mode == "mode=2");
+    const Rectification rectification(camera);
     auto system = std::make_unique<System>();
     dso::ImageAndExposure image(camera.width, camera.height);
     link.ready(visnav::Link::PoseOf::camera, true);
     std::vector<std::int64_t> stamps;  // by the number of the frame
     while (const auto frame = link.next()) {
-        const visnav::Image& grey = frame->image("mono8");
-        for (int v = 0; v < grey.height; ++v)
-            std::copy_n(grey.row<std::uint8_t>(v), grey.width, image.image + v * grey.width);
+        rectification.rectify(frame->image("mono8"), image.image);
         image.timestamp = 1e-9 * frame->stamp;
         const int number = static_cast<int>(frame->sequence);
         system->full.addActiveFrame(&image, number);
