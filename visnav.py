@@ -173,8 +173,8 @@ def run(
     """
     _check_runtime()
     from runtime.errors import ConfigError
-    from runtime.run.execute import ThreadedRun
     from runtime.run.results import Folder
+    from runtime.run.threaded_run import ThreadedRun
     from runtime.tools.cli.run import observed
     from runtime.tools.preflight import of_file
 

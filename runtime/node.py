@@ -131,7 +131,7 @@ class Node(Generic[C]):
     """
     starts_programs: ClassVar[bool] = False
     """Whether the node starts programs under judgement: files of other nodes are then not in the
-    run's folder before its end (`runtime.run.results`).
+    run's folder before its end (`runtime.run.private_results`).
     """
     reads_truth: ClassVar[str] = ""
     """Purpose of receiving true poses, if not flying or estimating: ``judging``, ``recording``,

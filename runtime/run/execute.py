@@ -26,7 +26,7 @@ from runtime.logs import executor, file_handler, lines_of, logging_to
 from runtime.node import Node
 from runtime.run import event_loop, results
 from runtime.run.node_runner import log_error, with_place, wrap
-from runtime.run.results import Folder, private_results
+from runtime.run.results import Folder
 from runtime.run.summarise import summarise
 from runtime.run.supervisor import Supervisor
 from runtime.run.watchdogs import LoopWatchdog, ProgressWatchdog
@@ -80,6 +80,8 @@ def execute(
             log.info("the folder of the earlier run is now %s", folder.earlier)
         with contextlib.ExitStack() as private:
             if folder is not None and programs:
+                from runtime.run.private_results import private_results
+
                 run.private = private.enter_context(private_results(folder.path))
             summary = complete(event_loop.run_to_end(run.loop, run.main(), run.escaped))
         if folder is not None:
@@ -310,55 +312,3 @@ def _brief(value: Any) -> str:
     if isinstance(value, tuple) and value and isinstance(value[0], float):
         return "(" + ", ".join(f"{v:.4g}" for v in value) + ")"
     return f"{value:.6g}" if isinstance(value, float) else repr(value)
-
-
-class ThreadedRun(threading.Thread):
-    """Thread of one run, for a caller whose own loop goes on; the arguments are those of `execute`.
-
-    A notebook has a loop that runs already, and a script may start several runs at a time.
-    """
-
-    def __init__(
-        self, config: Config, out: Folder, handlers: list[logging.Handler], watch: Watch
-    ) -> None:
-        super().__init__(name=f"run {config.run.name}", daemon=True)
-        self._config = config
-        self._out = out
-        self._handlers = handlers
-        self._watch = watch
-        self._end: Callable[[], object] | None = None
-        self._interrupted = False
-        self._error: BaseException | None = None
-        self._over = threading.Event()
-
-    def run(self) -> None:
-        """Run to the end; called by the thread."""
-        try:
-            execute(self._config, self._out, handlers=self._handlers, watch=self._watching)
-        except BaseException as error:
-            self._error = error
-        finally:
-            self._over.set()
-
-    @contextlib.contextmanager
-    def _watching(self, supervisor: Supervisor) -> Iterator[None]:
-        loop = asyncio.get_running_loop()
-        self._end = lambda: loop.call_soon_threadsafe(supervisor.stop, "Ctrl-C")
-        if self._interrupted:
-            self._end()
-        with self._watch(supervisor):
-            yield
-
-    def wait(self) -> None:
-        """Wait for the end; raise what went wrong. Ctrl-C ends the run, a second is raised."""
-        try:
-            self._over.wait()
-        except BaseException:
-            self._interrupted = True
-            if self._end is not None:
-                with contextlib.suppress(RuntimeError):  # the loop is closed
-                    self._end()
-            self._over.wait()
-            raise
-        if self._error is not None:
-            raise self._error

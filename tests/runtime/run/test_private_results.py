@@ -15,7 +15,7 @@ from runtime import Node, NodeConfig, Tick, every
 from runtime.config.model import Config, RunConfig
 from runtime.errors import VisnavError
 from runtime.run.execute import execute
-from runtime.run.results import private_results
+from runtime.run.private_results import private_results
 from runtime.testing import spec
 from runtime.units import Duration
 
@@ -73,7 +73,7 @@ def test_the_truth_is_not_there_before_the_end_and_then_it_is(
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from runtime.run.results import private_results
+from runtime.run.private_results import private_results
 with private_results(Path(sys.argv[1])) as folder:
     (folder / "truth.tum").write_text("recorded")
     os.kill(os.getpid(), signal.SIGKILL)

@@ -16,9 +16,9 @@ import pytest
 from runtime import Duration, Node
 from runtime.config.model import Config, RunConfig
 from runtime.errors import NodeError
-from runtime.run.execute import ThreadedRun
 from runtime.run.results import Folder
 from runtime.run.supervisor import Supervisor
+from runtime.run.threaded_run import ThreadedRun
 from runtime.testing import spec
 from tests.runtime.samples import Failing, Speaker
 from tests.runtime.samples_logs import Lines
