@@ -8,8 +8,9 @@ Read the core in this order:
   `channels.links` if imperfect; who may send in which name: `channels.sources`; its speed:
   `channels.tasks`, `run.event_loop`.
 - Time: `time.clock`, `lockstep`, `stepping`; limits in `time.real_time`.
-- A run: `run.node_runner`, `run_state` (with the `instruments` of observers), `supervisor`,
-  `execute`; `watchdogs` find the node that blocks the loop or holds up the run.
+- A run: `run.node_runner`, `run_state`, `node_services` (what nodes ask for, with the `instruments`
+  of observers), `parameters`, `supervisor`, `execute`; `watchdogs` find the node that blocks the
+  loop or holds up the run.
 - Results: the digest in `channels.wire`, `summary` (made by `run.summarise`), `run.results`,
   `logs`.
 - `config`: the file, and changes during a run; `units`, `paths` and `changeable` are types of

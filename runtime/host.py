@@ -87,12 +87,10 @@ class Host:
         siblings: All nodes of the run, in file order.
         out: Folder for files of nodes, or `None`; `out_of_programs` of those that start programs.
         shared: Objects shared by nodes of this process, by name.
-        run_end: How the run ended; `None` before.
         stepping: Control of the clock, set by who makes the host.
     """
 
     checking = False
-    run_end: RunEnd | None = None
     stepping: Stepping
 
     def __init__(
@@ -107,6 +105,11 @@ class Host:
         self.out: Path | None = None
         self.out_of_programs: Path | None = None
         self.shared: dict[str, Any] = {}
+
+    @property
+    def run_end(self) -> RunEnd | None:
+        """How the run ended; `None` before."""
+        return None
 
     def start(self, node: Any, coro: Coroutine[Any, Any, None]) -> Any:
         """Run a coroutine as part of a node, and return its task."""

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import msgspec
 
-from runtime.channels.answers import Answers, Outcome, Wrong
 from runtime.channels.wire import combined
-from runtime.workers.costs import Costs
+
+if TYPE_CHECKING:
+    from runtime.channels.answers import Answers
+    from runtime.workers.costs import Costs
 
 
 class Stall(msgspec.Struct, frozen=True):
@@ -176,6 +178,8 @@ class OutsideSummary(msgspec.Struct, frozen=True):
     @classmethod
     def of(cls, answers: Answers) -> OutsideSummary:
         """Return the summary of a system's answers."""
+        from runtime.channels.answers import Outcome, Wrong  # only with such a system
+
         counts: dict[str, Any] = {
             name: answers.counts[name] for name in (*get_args(Outcome), *get_args(Wrong))
         }

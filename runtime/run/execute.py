@@ -165,7 +165,7 @@ class _Run:
         )
         supervisor.state.code = self.code
         if self.folder is not None:
-            supervisor.state.before_first_update = self.folder.flown
+            supervisor.before_first_update = self.folder.flown
         # In lockstep nothing comes of it but a longer wait; the table at the end has it, too.
         level = logging.DEBUG if run.clock == "lockstep" else logging.WARNING
         watchdog = LoopWatchdog(loop, run.stall, functools.partial(_report_stall, level))

@@ -1,4 +1,10 @@
-"""Instruments of a run: what measures calls, tasks, tickers and workers while they are attached."""
+"""Instruments of a run: what measures calls, tasks, tickers and workers while they are attached.
+
+Attaching one connects the run anew and replaces the functions that tickers and coroutines call;
+detaching restores them. A run without instruments does not even ask for them. For instruments see
+`runtime.tools.tracing` and `runtime.tools.monitor`. The idea is trio's
+(https://trio.readthedocs.io, Instrument API).
+"""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from events import (
     Announcement,
@@ -22,7 +22,6 @@ from events import (
     PathAnnouncement,
     PilotAnnouncement,
 )
-from runtime.channels.answers import Answers
 from runtime.channels.wire import Digest, combined, fingerprint
 from runtime.commit import commit
 from runtime.json_values import plain
@@ -39,6 +38,9 @@ from runtime.summary import (
     verdict_of,
 )
 from runtime.time.clock import SECOND
+
+if TYPE_CHECKING:
+    from runtime.channels.answers import Answers
 
 
 def environment() -> dict[str, str]:

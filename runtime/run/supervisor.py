@@ -16,7 +16,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Collection, Coroutine, Sequence
+from collections.abc import Callable, Collection, Coroutine, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,9 @@ from runtime.run import event_loop, graph
 from runtime.run.event_loop import RunTask
 from runtime.run.instruments import Instruments
 from runtime.run.node_runner import Announced, NodeRunner, Phase, log_error, start_up, wrap
+from runtime.run.node_services import NodeServices
 from runtime.run.others import Others
+from runtime.run.parameters import Parameters
 from runtime.run.run_state import RunState
 from runtime.time.clock import SECOND, Clock, Once
 
@@ -52,6 +54,9 @@ class Supervisor:
         out_of_programs: That for nodes that start programs, if it is another one.
         only: Nodes that run here, if others run in other processes.
         scripted: Nodes that may send in any name: scripts of tests.
+
+    Attributes:
+        before_first_update: Called once all nodes are ready; what it raises ends the run.
     """
 
     def __init__(
@@ -67,17 +72,18 @@ class Supervisor:
         here = [spec for spec in config.nodes if not only or spec.name in only]
         runners = {spec.name: NodeRunner(spec, self._create_task) for spec in here}
         self.instruments = Instruments(runners, self._reconnect)
-        self.state = RunState(
-            config,
-            clock,
-            runners,
+        self.state = RunState(config, clock, runners)
+        self.parameters = Parameters(self.state, self.fault)
+        self.services = NodeServices(
+            self.state,
             self.instruments,
             self._create_task,
             lambda node, reason: self.stop(reason, by=node),
             self.fault,
         )
-        self.state.out, self.state.out_of_programs = out, out_of_programs or out
-        self.stepping = self.state.stepping
+        self.services.out, self.services.out_of_programs = out, out_of_programs or out
+        self.stepping = self.services.stepping
+        self.before_first_update: Callable[[], None] = lambda: None
         self._taps = tuple(taps)
         self._owners = SourceOwners([spec.name for spec in config.nodes], scripted)
         self.others = Others(clock)
@@ -101,7 +107,7 @@ class Supervisor:
         finally:  # there are none left but those that would not end, unless this was cancelled
             for task in self._tasks:
                 task.cancel()
-            self.state.close()
+            self.services.close()
 
     def _create_task(self, coro: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
         task = asyncio.get_running_loop().create_task(coro, name=name)
@@ -240,7 +246,7 @@ class Supervisor:
         )
         self._record_inputs(listeners)
         self.others.connect(listeners, self._listener_failed)
-        self.state.changes.connect(listeners, taps, self._listener_failed)
+        self.parameters.connect(listeners, taps, self._listener_failed)
 
     def _record_inputs(self, listeners: list[Listener]) -> None:
         """Record the receivers of true poses, images and scans, also of restarted nodes."""
@@ -271,7 +277,7 @@ class Supervisor:
         state = self.state
         try:
             announced = await self._start_nodes()
-            state.before_first_update()
+            self.before_first_update()
         except PeerError as error:
             log.error("%s", error, extra={"reported": True})
             self.stop("the processes of the run did not come together", error, by="runtime")
@@ -305,8 +311,8 @@ class Supervisor:
         for index, spec in enumerate(state.config.nodes):
             if spec.name in state.runners:
                 state.clock.schedule.order = (index + 1) << 32  # as if all nodes were here
-                self.state.run_node(state.runners[spec.name])
-        state.send_early_changes()
+                self.services.run_node(state.runners[spec.name])
+        self.parameters.send_early()
         self.others.nodes_run()
 
     async def _start_nodes(self) -> list[Announcement]:
@@ -350,7 +356,7 @@ class Supervisor:
     async def _start_node(self, runner: NodeRunner) -> None:
         state = self.state
         try:
-            await runner.start_up(self.state, state.config.run.startup_limit)
+            await runner.start_up(self.services, state.config.run.startup_limit)
         finally:
             if runner.node is not None and runner.node not in state.all_nodes:
                 state.all_nodes.append(runner.node)
@@ -383,7 +389,7 @@ class Supervisor:
                 continue
             runner.restarting = False
             self.connect()
-            self.state.run_node(runner)
+            self.services.run_node(runner)
             return
 
     # Ending.

@@ -268,18 +268,17 @@ def _read(path: Path) -> tuple[memoryview, Calls] | None:
 
 @contextlib.contextmanager
 def _replaying(content: memoryview, calls: Calls, supervisor: Supervisor) -> Iterator[None]:
-    state = supervisor.state
     remaining = {name: iter(answers) for name, answers in calls.items()}
 
     def make(name: str, *args: Any, **options: Any) -> Worker[Any]:
         if name not in remaining:
             return Worker(name, *args, **options)
-        state.costs.pop(name, None)  # a replayed worker costs nothing
+        supervisor.state.costs.pop(name, None)  # a replayed worker costs nothing
         worker = _ReplayedWorker(name, *args, **options)
         worker.content, worker.remaining = content, remaining[name]
         return worker
 
-    state.make_worker = make
+    supervisor.services.make_worker = make
     yield
 
 

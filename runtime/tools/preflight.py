@@ -43,7 +43,7 @@ from runtime.run import event_loop
 from runtime.run.execute import make_clock, make_loop
 from runtime.run.graph import circles, edges_of, input_types, unconnected
 from runtime.run.node_runner import Announced, NodeRunner, Phase, start_up
-from runtime.run.run_state import siblings
+from runtime.run.node_services import siblings
 from runtime.time.clock import Clock, Tick, Ticker
 from runtime.time.stepping import Stepping
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from typing import Any
 
 import msgspec
 
@@ -13,6 +12,7 @@ from events import Event
 from runtime import Input, Node, NodeConfig, Output, Tick, every, on
 from runtime.changeable import Changeable
 from runtime.workers.worker import Worker
+from tests.runtime.samples_runs import supervisor_of
 
 
 class Word(Event):
@@ -57,12 +57,11 @@ class Tuner(Node):
     """Changes many settings at once, again and again."""
 
     async def run(self) -> None:
-        host: Any = self._host
         for number in range(2, 8):
             await self.clock.sleep(0.1)
             gains = ", ".join(f"{name} = {number}.5" for name in Gains.__struct_fields__)
             with contextlib.suppress(Exception):  # while the talker is away
-                host.set_parameter(f"talker.gains = {{ {gains} }}")
+                supervisor_of(self).parameters.set(f"talker.gains = {{ {gains} }}")
 
 
 class Crowd(Node):

@@ -17,6 +17,7 @@ from typing import Any, Literal, NoReturn
 from events import Announcement
 from runtime import Node, NodeConfig, Output, Tick, every, on
 from tests.runtime.samples import Offer, Ping
+from tests.runtime.samples_runs import supervisor_of
 
 PLACES = (
     "on_startup",
@@ -251,7 +252,7 @@ class Phased(Node[PhasedConfig]):
             await asyncio.to_thread(self.outlast_signal)
 
     def outlast_signal(self) -> None:
-        host: Any = self._host
-        while not host.stop_requested:
+        state = supervisor_of(self).state
+        while not state.stop_requested:
             time.sleep(0.01)
         time.sleep(0.3)  # real: a thread knows no other time

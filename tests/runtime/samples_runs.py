@@ -11,6 +11,7 @@ from events import Event
 from runtime import Duration
 from runtime.channels.sender import Sender
 from runtime.config.model import Config, NodeSpec, RunConfig
+from runtime.node import Node
 from runtime.run import event_loop as task_factory
 from runtime.run.execute import make_clock, make_loop
 from runtime.run.supervisor import Supervisor
@@ -25,6 +26,14 @@ class Outcome:
         self.error = supervisor.state.error
         self.sent = sent
         self.seconds = seconds
+
+
+def supervisor_of(node: Node[Any]) -> Supervisor:
+    """Return the supervisor of a node's run, which a monitor is given and a node is not."""
+    services: Any = node._host
+    supervisor = services._fault.__self__
+    assert isinstance(supervisor, Supervisor)
+    return supervisor
 
 
 def supervise(

@@ -329,7 +329,7 @@ class Observer:
             case protocol.Restart(node=node):
                 return self._restart(node)
             case protocol.Set(text=text):
-                values = self._supervisor.state.set_parameter(text)
+                values = self._supervisor.parameters.set(text)
                 return ", ".join(f"{key} = {value}" for key, value in values.items()) or "as it was"
 
     def _restart(self, name: str) -> str:

@@ -1,21 +1,16 @@
-"""Settings that change while a run goes on."""
+"""Settings that may change while a run goes on."""
 
 from __future__ import annotations
 
-import logging
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import pytest
 
-from events import ParameterChanged, VelocitySetpoint
-from runtime import Duration, Node, NodeConfig
+from runtime import Duration, NodeConfig
 from runtime.changeable import Changeable
 from runtime.config.parameters import change, changeable, settings
 from runtime.errors import ConfigError
-from runtime.run.supervisor import Supervisor
-from runtime.testing import spec
-from tests.runtime.samples_loop import Camera, Estimator, Listener, Pilot, look, until_sent
 
 
 class Lens(msgspec.Struct, frozen=True, kw_only=True):
@@ -94,87 +89,3 @@ def test_what_can_change_is_listed_with_its_values() -> None:
     assert values["lenses.rear.loss"] == "0.0"
     assert values["speed"] == "1.0"
     assert "height" not in values
-
-
-@pytest.mark.parametrize("clock", ["lockstep", "real"])
-def test_a_change_in_a_run_holds_from_then_on_and_is_recorded(
-    clock: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.INFO)
-
-    async def body(supervisor: Supervisor) -> None:
-        await until_sent(supervisor, "pilot", 1)
-        assert supervisor.state.set_parameter("pilot.gain=3") == {"gain": "3.0"}
-        with pytest.raises(ConfigError, match="pilot refuses: expected a gain that brings no"):
-            supervisor.state.set_parameter("pilot.gain=13")
-        if clock == "real":
-            await until_sent(supervisor, "pilot", 1)
-            supervisor.stop("seen enough")
-
-    nodes = [
-        spec(Camera, "drone"),
-        spec(Estimator, "vo"),
-        spec(Pilot, "pilot"),
-        spec(Listener, "listener"),
-    ]
-    looked = look(nodes, body, clock=clock, duration=0.4 if clock == "lockstep" else 60)
-    (changed,) = [e for e in looked.sent if isinstance(e, ParameterChanged)]
-    assert (changed.source, changed.key, changed.value) == ("pilot", "gain", "3.0")
-    assert [line for line in caplog.messages if "is now" in line] == ["pilot.gain is now 3.0"]
-    gains = [e.velocity[0] for e in looked.sent if isinstance(e, VelocitySetpoint)]
-    assert sorted(gains) == gains
-    assert set(gains) == {1.0, 3.0}
-    listener = looked.supervisor.state.all_nodes[3]
-    assert isinstance(listener, Listener)
-    assert listener.heard == ["pilot.gain=3.0"]
-    if clock == "lockstep":
-        assert looked.digest != look(nodes, duration=0.4).digest
-
-
-def test_a_node_that_restarts_keeps_what_was_changed() -> None:
-    async def body(supervisor: Supervisor) -> None:
-        await supervisor.state.clock.sleep(0.2)
-        supervisor.state.set_parameter("pilot.gain=3")
-        supervisor.restart("pilot", anyway=True)
-
-    looked = look([spec(Pilot, "pilot")], body)
-    first, second = looked.supervisor.state.all_nodes
-    assert first is not second
-    assert isinstance(second, Pilot)
-    assert second.config.gain == 3.0
-
-
-def test_a_node_that_has_not_started_cannot_change() -> None:
-    class First(Node):
-        async def on_startup(self) -> None:
-            host: Any = self._host
-            with pytest.raises(ConfigError, match="pilot does not just now"):
-                host.set_parameter("pilot.gain=3")
-
-    look([spec(First, "first"), spec(Pilot, "pilot")], duration=0.1)
-
-
-def test_a_change_before_the_first_update_is_told_as_the_run_begins() -> None:
-    class Last(Node):
-        async def on_startup(self) -> None:
-            host: Any = self._host
-            host.set_parameter("pilot.gain=3")
-
-    looked = look(
-        [spec(Pilot, "pilot"), spec(Last, "last"), spec(Listener, "listener")], duration=0.3
-    )
-    assert [e.value for e in looked.sent if isinstance(e, ParameterChanged)] == ["3.0"]
-    listener = looked.supervisor.state.all_nodes[2]
-    assert isinstance(listener, Listener)
-    assert listener.heard == ["pilot.gain=3.0"]
-
-
-def test_a_node_that_does_not_run_cannot_change() -> None:
-    async def body(supervisor: Supervisor) -> None:
-        await supervisor.state.clock.sleep(0.2)
-        supervisor.restart("pilot", anyway=True)
-        await supervisor.state.clock.sleep(0.2)
-        with pytest.raises(ConfigError, match="expected a node that runs"):
-            supervisor.state.set_parameter("pilot.gain=3")
-
-    look([spec(Pilot, "pilot")], body)

@@ -17,6 +17,7 @@ from runtime.run.instruments import Call, Instrument
 from runtime.run.supervisor import Supervisor
 from runtime.testing import spec
 from tests.runtime.samples_loop import Camera, Estimator, Pilot, look, until_sent
+from tests.runtime.samples_runs import supervisor_of
 from tests.runtime.samples_workers import Plant
 
 NODES = [spec(Camera, "drone"), spec(Estimator, "vo"), spec(Pilot, "pilot")]
@@ -137,9 +138,11 @@ def test_an_instrument_does_not_let_nodes_send_before_the_first_update() -> None
 
     class Late(Node):
         async def on_startup(self) -> None:
-            host: Any = self._host
-            host.instruments.attach(Eye())
-            early = senders(host.runners["drone"].node)["images"]
+            supervisor = supervisor_of(self)
+            supervisor.instruments.attach(Eye())
+            drone = supervisor.state.runners["drone"].node
+            assert drone is not None
+            early = senders(drone)["images"]
             with pytest.raises(ChannelClosedError):
                 early.send(None)
             refused.append(early.name)

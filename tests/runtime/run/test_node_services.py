@@ -7,7 +7,6 @@ import logging
 import threading
 from collections.abc import Callable
 from typing import Any, ClassVar
-from unittest import mock
 
 import pytest
 
@@ -15,15 +14,15 @@ from runtime import Duration, Input, Node, Tick, every
 from runtime.config.model import Config, RunConfig
 from runtime.errors import NodeError, WorkerDiedError
 from runtime.host import Sibling
-from runtime.run import run_state
 from runtime.run.execute import execute
 from runtime.run.instruments import Instrument
+from runtime.run.node_services import siblings
 from runtime.summary import Summary
 from runtime.testing import spec
 from runtime.time.clock import Ticker
 from tests.runtime.samples import Ping, Speaker
 from tests.runtime.samples_loop import look
-from tests.runtime.samples_runs import supervise
+from tests.runtime.samples_runs import supervise, supervisor_of
 from tests.runtime.samples_workers import Plant, plain
 
 pytestmark = pytest.mark.timeout(20)
@@ -142,38 +141,6 @@ def test_what_a_coroutine_tick_raises_is_its_nodes_fault() -> None:
         summary_of(Weak)
 
 
-@pytest.mark.parametrize(
-    ("simulated", "real", "limit"), [(0, 0, 4.0), (100, 0, 9.0), (100, 200, 14.0)]
-)
-def test_the_limit_of_an_end_grows_by_a_twentieth_of_the_longer_time(
-    simulated: int, real: int, limit: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    limits = []
-
-    class Asks(Node):
-        async def on_startup(self) -> None:
-            self.ask()
-
-        async def run(self) -> None:
-            await self.clock.sleep(simulated)
-            wall = mock.Mock()
-            wall.monotonic.return_value = host_of(self).first_update + real
-            with monkeypatch.context() as patch:
-                patch.setattr(run_state, "time", wall)
-                self.ask()
-
-        def ask(self) -> None:
-            limits.append(host_of(self).shutdown_limit())
-
-    supervise([spec(Asks, "a")], duration=1000, shutdown_limit=4)
-    assert limits == [pytest.approx(4.0), pytest.approx(limit)]
-
-
-def host_of(node: Node[Any]) -> Any:
-    """Return the run's state, as an instrument has it."""
-    return node._host
-
-
 class Busy(Node):
     """Gives threads more to do than they can begin, until the run is over."""
 
@@ -220,7 +187,7 @@ def test_tasks_that_have_ended_are_kept_no_longer() -> None:
         async def run(self) -> None:
             for _ in range(10):
                 self.start(self.beside())
-            runner = host_of(self).runners["s"]
+            runner = supervisor_of(self).state.runners["s"]
             self.left.append(len(runner.tasks))
             await self.clock.sleep(0.5)
             self.left.append(len(runner.tasks))
@@ -248,7 +215,7 @@ def test_an_instrument_sees_what_is_started_later_by_its_own_name() -> None:
 
     class Later(Node):
         async def run(self) -> None:
-            host_of(self).instruments.attach(steps)
+            supervisor_of(self).instruments.attach(steps)
             self.start(self.beside())
             self.every(1, self.look)
 
@@ -285,8 +252,8 @@ class Gardener(Node):
     does: ClassVar[Callable[[Any, Any], object]] = lambda _node, _worker: None
 
     async def run(self) -> None:
-        host = host_of(self)
-        host.make_worker = FakeWorker
+        make: Any = FakeWorker
+        supervisor_of(self).services.make_worker = make
         worker: Any = await self.worker(type(self).factory, latency=0.25)
         assert worker is FakeWorker.made[-1]
         assert FakeWorker.made[-1].is_ready
@@ -343,7 +310,7 @@ def test_an_instrument_looks_at_workers_that_come_later(monkeypatch: pytest.Monk
 
     class Watched(Gardener):
         async def run(self) -> None:
-            host_of(self).instruments.attach(Eye())
+            supervisor_of(self).instruments.attach(Eye())
             await super().run()
 
     monkeypatch.setattr(Gardener, "does", lambda _, w: w.called("g.Plant", "pid", None))
@@ -452,4 +419,4 @@ def test_siblings_say_which_of_them_are_here() -> None:
         Sibling("a", Speaker, nodes[0].config, {}, True),
         Sibling("b", Speaker, nodes[1].config, {}, False),
     )
-    assert run_state.siblings(config, {"a"}) == expected
+    assert siblings(config, {"a"}) == expected

@@ -15,6 +15,7 @@ from runtime.errors import NodeError, NodeTimeoutError
 from runtime.run.execute import execute
 from runtime.summary import Summary
 from runtime.testing import spec
+from tests.runtime.samples_runs import supervisor_of
 
 REASONS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM", signal.SIGHUP: "SIGHUP"}
 pytestmark = pytest.mark.timeout(20)
@@ -122,9 +123,10 @@ class Blocking(Node):
     """Blocks the loop until the run interrupts it, as it does with a node beyond its limit."""
 
     async def run(self) -> None:
-        host: Any = self._host
         signal.raise_signal(signal.SIGUSR2)  # which is not for this node: it goes on
-        host.interruption = NodeTimeoutError(self.name, "expected it to give back the loop")
+        supervisor_of(self).state.interruption = NodeTimeoutError(
+            self.name, "expected it to give back the loop"
+        )
         try:
             signal.raise_signal(signal.SIGUSR2)
         finally:

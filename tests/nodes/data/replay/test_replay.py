@@ -27,6 +27,7 @@ from runtime.errors import ConfigError, FatalError
 from runtime.testing import NodeResult, run_nodes, spec
 from tests.nodes.data.dataset.samples import flight
 from tests.nodes.data.replay import sets
+from tests.runtime.samples_runs import supervisor_of
 
 MS = 1_000_000
 
@@ -179,8 +180,7 @@ class Setting(Pausing):
         self.set("paused=false")
 
     def set(self, text: str) -> None:
-        host: Any = self._host
-        host.set_parameter(f"{self.drone.name}.{text}")
+        supervisor_of(self).parameters.set(f"{self.drone.name}.{text}")
 
 
 class Going(Setting):
@@ -211,8 +211,8 @@ class Overshooting(Seeking):
 
 
 def _replay_of(witness: Node[Any]) -> Replay:
-    host: Any = witness._host
-    return next(node for node in host.all_nodes if isinstance(node, Replay))
+    nodes = supervisor_of(witness).state.all_nodes
+    return next(node for node in nodes if isinstance(node, Replay))
 
 
 def test_a_pause_makes_all_that_follows_later(path: Path) -> None:
