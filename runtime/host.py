@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import functools
+import math
 from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -88,9 +89,11 @@ class Host:
         out: Folder for files of nodes, or `None`; `out_of_programs` of those that start programs.
         shared: Objects shared by nodes of this process, by name.
         stepping: Control of the clock, set by who makes the host.
+        shutdown_limit: Real seconds that a node's `on_end` and `on_shutdown` may take at least.
     """
 
     checking = False
+    shutdown_limit = math.inf
     stepping: Stepping
 
     def __init__(

@@ -348,6 +348,11 @@ class Node(Generic[C]):
         """How the run ended, for `on_end` and `on_shutdown`; `None` before."""
         return self._host.run_end
 
+    @property
+    def shutdown_limit(self) -> float:
+        """Real seconds that `on_end` and `on_shutdown` may take, each; a long run gives more."""
+        return self._host.shutdown_limit
+
     def conclude(
         self,
         subject: str,

@@ -55,6 +55,7 @@ class NodeServices(Host):
     ) -> None:
         super().__init__(state.clock, state.config.run.seed, siblings(state.config, state.runners))
         self.stepping = Stepping(state.clock, lambda: bool(state.reason))
+        self.shutdown_limit = state.config.run.shutdown_limit
         self._state = state
         self._instruments = instruments
         self.make_worker: Callable[..., Worker[Any]] | None = None

@@ -179,6 +179,7 @@ class _DryHost(Host):
         names = {spec.name for spec in config.nodes}
         super().__init__(clock, config.run.seed, siblings(config, names))
         self.stepping = Stepping(clock)
+        self.shutdown_limit = config.run.shutdown_limit
         self.executor = concurrent.futures.ThreadPoolExecutor(
             max_workers=2, thread_name_prefix="offload"
         )

@@ -456,6 +456,12 @@ def _held(
     }
 
 
+_LEAST_POSES: dict[AlignmentMethod, int] = {
+    "none": 1, "origin": 2, "posyaw": 2, "se3": 3, "sim3": 3
+}  # fmt: skip
+"""Poses below which an alignment leaves no error to see."""
+
+
 def _judge_final(
     record: EstimatorRecord,
     truth: Trajectory,  # of the lever's end
@@ -478,6 +484,8 @@ def _judge_final(
     try:
         final = record.final.take(one_a_step(record.final.stamps)).moved(lever)
         true_poses, estimated = pair(truth, final, hole)
+        if (count := len(estimated)) < (least := _LEAST_POSES[how]):
+            raise ValueError(f"expected at least {least} poses to align by {how}, found {count}")
         orientations = examine(true_poses, estimated)
         how = _possible(how, alignment, align_first, orientations)
         moved = align(estimated, true_poses, how, align_first).trajectory
@@ -497,6 +505,8 @@ def _judge_final(
     offset = best_time_offset(truth, final, with_scale=how == "sim3")
     if offset is not None:
         notes.append(offset.text())
+    if len(estimated) < len(final):
+        notes.append(f"{len(final) - len(estimated)} of its {len(final)} poses have no truth")
     note = "; ".join(filter(None, notes))
     return moved.moved(-lever), f"after loop closures: {note}" if note else ""
 

@@ -162,7 +162,7 @@ def read_trajectory(body: bytearray) -> LinkTrajectory:
         )
     rows = np.frombuffer(body, STAMPED_POSE)
     stamps = rows["stamp"].astype(np.int64)
-    if (falls := np.flatnonzero(np.diff(stamps) <= 0)).size:
+    if (falls := np.flatnonzero(stamps[1:] <= stamps[:-1])).size:
         before, after = stamps[falls[0]], stamps[falls[0] + 1]
         raise LinkError(
             f"TRAJECTORY.stamp: expected them to rise strictly, found {after} after {before}"

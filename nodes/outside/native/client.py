@@ -155,6 +155,7 @@ class Link:
         path = path or os.environ.get("VISNAV_SOCKET", "")
         self._sending = threading.Lock()
         self._expected = 0
+        self._promised = False
         self._kinds: dict[str, str] = {}
         self._records = RECORDS
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -211,6 +212,7 @@ class Link:
             pose_of: Whose poses: of the optical ``camera`` 0, or the ``body``.
             trajectory: Whether a trajectory comes when the run has ended; see `trajectory`.
         """
+        self._promised = trajectory
         self._send(READY, READY_BODY.pack(POSE_OF[pose_of], trajectory))
 
     def __iter__(self) -> Iterator[Frame]:
@@ -349,7 +351,12 @@ class Link:
         Args:
             stamps: Those of frames (ns), strictly rising, shape (n,).
             poses: As those of `pose`, in the same frame, shape (n, 4, 4) or (n, 3, 4).
+
+        Raises:
+            ProtocolError: `ready` has not promised it.
         """
+        if not self._promised:
+            raise ProtocolError("expected ready(trajectory=True) before a trajectory, found none")
         matrices = np.asarray(poses, "<f8")
         rows = np.empty(len(matrices), STAMPED_POSE)
         rows["stamp"] = stamps

@@ -287,7 +287,7 @@ class Endpoint:
                 lambda: program.trajectory or program.gone or self._closed, seconds
             )
             if program.trajectory is None:
-                found = program.end_reason or f"none within {seconds:g} s"
+                found = program.end_reason or "none yet"
                 raise LinkError(f"{program.name}: expected its trajectory, found {found}")
             return program.trajectory
 
@@ -367,6 +367,8 @@ class Endpoint:
                 self._problem = f"found {program.name}: {reason}"
             closed = self._closed
             self._changed.notify_all()
+        if wrong and program.finished:
+            self._logged(bytearray(f"after the run: {reason}", "utf-8"))
         refused = wrong and not program.poses
         head = (wire.REFUSED, GREETING) if refused else (wire.BYE,)
         self._selector.unregister(program.connection)
@@ -417,6 +419,8 @@ class Endpoint:
                 self._changed.notify_all()
             self._on_ready()
         elif kind == wire.TRAJECTORY and program.poses and program.promised:
+            if not program.finished:
+                raise LinkError("TRAJECTORY: expected it after the run's BYE, found it before")
             if program.trajectory is not None:
                 raise LinkError("TRAJECTORY: expected one, found a second")
             trajectory = program.poses.of_trajectory(read_trajectory(body))

@@ -24,6 +24,7 @@
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
+#include <exception>
 #include <locale>
 #include <map>
 #include <mutex>
@@ -242,7 +243,7 @@ public:
         welcome();
     }
     ~Link() {
-        send(5, "");
+        send(5, std::uncaught_exceptions() ? "in an exception" : "");
         if (memory_) ::munmap(memory_, size_);
     }
 
@@ -264,6 +265,7 @@ public:
     // Tell the run to begin, and what comes: poses of the optical camera 0, or of the body (FRD), and
     // whether a trajectory when the run has ended.
     void ready(PoseOf of = PoseOf::camera, bool trajectory = false) {
+        promised_ = trajectory;
         send(4, words(of, trajectory));
     }
 
@@ -315,6 +317,7 @@ public:
     // Give the final trajectory after the last frame, if ready() promised it: poses of frames, in
     // the frame of those answered, the stamps rising.
     void trajectory(const std::vector<StampedPose>& poses) {
+        if (!promised_) throw Error("expected ready(…, true) before a trajectory");
         std::string body;
         append(body, poses.data(), poses.size() * sizeof(StampedPose));
         send(36, body);
@@ -468,6 +471,7 @@ private:
     void* memory_ = nullptr;
     std::size_t size_ = 0;
     std::uint64_t expected_ = 0;
+    bool promised_ = false;             // a trajectory
 };
 
 }  // namespace visnav

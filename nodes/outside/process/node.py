@@ -207,6 +207,9 @@ class Process(Estimator[ProcessConfig]):
                     'hold.skips: expected a latency above the camera\'s period with "allowed": no '
                     "later frame goes out while time waits for this one"
                 )
+        if config.grace > self.shutdown_limit:
+            limit = f"{self.shutdown_limit:g} s (run.shutdown_limit)"
+            yield f"grace: expected at most {limit}, found {float(config.grace):g} s"
         setting = "build" if self.checking and config.build else "command"  # built later
         if command := getattr(config, setting):
             yield from filter(None, [self._launch.missing(setting, command)])
@@ -384,16 +387,14 @@ class Process(Estimator[ProcessConfig]):
         """Send the program's final trajectory, if it promised one."""
         if self._feed is None or not self._feed.promised:
             return
-        self._closing = True
+        self._closing, grace = True, float(self.config.grace)
         try:
-            trajectory = await self.offload(self._feed.finish, float(self.config.grace))
+            trajectory = await self.offload(self._feed.finish, grace)
         except LinkError as error:
+            story = await self.offload(self._story, f"{error}, within {grace:g} s (grace)")
             if self.config.hold.on_missing == "error":
-                raise ProgramError(str(error)) from None
-            self.log.warning("%s", error)
-            return
-        if not len(trajectory.stamps):
-            self.log.warning("its final trajectory is empty")
+                raise ProgramError(story) from None
+            self.log.warning("%s", story)
             return
         offset = self.the_camera().time_offset if self.config.images else 0.0
         stamps = trajectory.stamps - round(offset * 1e9)

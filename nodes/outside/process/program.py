@@ -218,6 +218,7 @@ class Feed:
         room: float,  # frames waiting to be sent, at most
         **options: Any,
     ) -> None:
+        self._stamps: list[int] = []  # of the frames that were sent (ns)
         self.left_out = 0  # number of frames without a free slot, or without a program
         self._hold, self._processes, self._waits, self._room = hold, processes, waits, room
         self._initialised = self._closed = False
@@ -253,12 +254,20 @@ class Feed:
         Takes `seconds` (real time) at most.
 
         Raises:
-            LinkError: It did not come.
+            LinkError: It did not come, is empty, or has stamps of no frame.
         """
         until = time.monotonic() + seconds
         self._outbox.put(None)
         self._sender.join(seconds)
-        return self._endpoint.finish(max(until - time.monotonic(), 0.0))
+        trajectory = self._endpoint.finish(max(until - time.monotonic(), 0.0))
+        if not (total := len(trajectory.stamps)):
+            raise LinkError("expected its trajectory, found an empty one")
+        if len(unknown := np.setdiff1d(trajectory.stamps, self._stamps)):
+            raise LinkError(
+                f"TRAJECTORY.stamp: expected stamps of frames, found {unknown[0]} "
+                f"({len(unknown)} of {total} are of none)"
+            )
+        return trajectory
 
     def close(self) -> None:
         """Close the connection to the program; takes two seconds at most."""
@@ -278,6 +287,7 @@ class Feed:
                 if not self._endpoint.send_frame(stamp, images, self._waits):
                     self.left_out += 1
                     continue
+                self._stamps.append(stamp)
                 self._hold.sent("frames", stamp.to_bytes(8, "little", signed=True))
                 for camera, kind, image in images:
                     self._hold.sent(f"{kind} {camera}", image.data)

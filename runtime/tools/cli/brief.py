@@ -141,7 +141,7 @@ def print_verdict(verdict: Verdict) -> None:
     for name, figures in verdict.estimators.items():
         reasons = "; ".join(str(reason) for reason in figures.get("failed", ()))
         print_words([_heading(name, figures) + (f": {escape(reasons)}" if reasons else "")])
-        print_words(f"  {escape(line)}" for line in _figures(figures))
+        print_words(f"  {escape(line)}" for line in (*_figures(figures), *_final(figures)))
 
 
 def print_failures(summary: Summary) -> None:
@@ -177,7 +177,7 @@ def lines(summary: Summary, folder: Path) -> Iterator[str]:
     estimators = summary.verdict.estimators if summary.verdict else {}
     for name, figures in estimators.items():
         yield _heading(name, figures)
-        yield from (f"  {escape(line)}" for line in _figures(figures))
+        yield from (f"  {escape(line)}" for line in (*_figures(figures), *_final(figures)))
         yield from (f"  {escape(line)}" for line in _flow(name, figures, summary))
     for vehicle, figures in (summary.verdict.flights if summary.verdict else {}).items():
         yield from _flight(vehicle, figures)
@@ -240,6 +240,17 @@ def _figures(figures: Mapping[str, Any]) -> Iterator[str]:
     if figures.get("lost_count") and figures.get("flight_ate_percent") is not None:
         parts.append(f"with lost time {significant(figures['flight_ate_percent'], 2)} %")
     yield f"{', '.join(parts)}   alignment: {figures.get('alignment', 'none')}"
+
+
+def _final(figures: Mapping[str, Any]) -> Iterator[str]:
+    if figures.get("why_not_final") is not None:
+        yield f"final trajectory not judged: {figures['why_not_final']}"
+    if figures.get("final_ate_rmse_m") is None:
+        return
+    text = f"final ATE {significant(figures['final_ate_rmse_m'], 3)} m"
+    if figures.get("final_ate_percent") is not None:
+        text += f" ({significant(figures['final_ate_percent'], 2)} %)"
+    yield f"{text} of {figures['final_poses']} poses after all corrections"
 
 
 def _flow(name: str, figures: Mapping[str, Any], summary: Summary) -> Iterator[str]:

@@ -29,10 +29,10 @@ from runtime.config.model import Config, RunConfig
 from runtime.run.execute import execute
 from runtime.run.made_from import code_of
 from runtime.run.summarise import command_line
-from runtime.summary import Summary, merged
+from runtime.summary import Summary, Verdict, merged
 from runtime.testing import run_nodes, spec
 from runtime.time.clock import Tick
-from runtime.tools.cli.brief import print_words, run_tables
+from runtime.tools.cli.brief import print_verdict, print_words, run_tables
 from tests.runtime.samples import Diarist, Failing, Painter, Ping, Reader, Speaker
 
 
@@ -257,3 +257,25 @@ def test_a_terminal_shows_whole_words_and_a_pipe_whole_lines(terminal: bool) -> 
         "a not judged: the user ended the run before its plan was flown"
     )
     assert len(rows) == (2 if terminal else 1)
+
+
+@pytest.mark.parametrize(
+    ("figures", "expected"),
+    [
+        ({}, []),
+        (
+            {"final_ate_rmse_m": 0.20234, "final_ate_percent": 3.94, "final_poses": 80},
+            ["  final ATE 0.202 m (3.9 %) of 80 poses after all corrections"],
+        ),
+        (
+            {"final_ate_rmse_m": 0.2, "final_ate_percent": None, "final_poses": 3},
+            ["  final ATE 0.2 m of 3 poses after all corrections"],
+        ),
+        ({"why_not_final": "no [x]"}, ["  final trajectory not judged: no [x]"]),
+    ],
+)
+def test_a_final_trajectory_has_a_line_of_its_own(
+    figures: dict[str, Any], expected: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    print_verdict(Verdict(passed=True, estimators={"est": {"passed": True, **figures}}))
+    assert capsys.readouterr().out.splitlines()[1:] == expected

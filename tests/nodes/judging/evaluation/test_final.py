@@ -12,6 +12,7 @@ import pytest
 
 from events import Event, LidarScan, PoseEstimate, TrajectoryEstimate
 from nodes.judging.evaluation import Evaluation
+from nodes.judging.evaluation.alignment import AlignmentMethod
 from nodes.judging.evaluation.judging import Judgement, errors_at_ticks, judge
 from nodes.judging.evaluation.record import EstimatorRecord
 from nodes.judging.report.folder import read_run
@@ -97,6 +98,31 @@ def test_two_poses_at_both_ends_do_not_hide_what_is_between() -> None:
     figures = judged(final(TRUTH.take(np.array([0, len(TRUTH) - 1])))).figures
     assert figures["final_ate_rmse_m"] < 1e-9
     assert figures["final_flight_ate_rmse_m"] > 0.5
+
+
+@pytest.mark.parametrize(
+    ("count", "alignment", "scale_free", "least"),
+    [(1, "origin", False, 2), (2, "se3", False, 3), (2, "sim3", True, 3)],
+)
+def test_fewer_poses_than_an_alignment_needs_have_no_error_of_zero(
+    count: int, alignment: AlignmentMethod, scale_free: bool, least: int
+) -> None:
+    record = EstimatorRecord(scale_free)
+    for poses, judged_ in ((count, False), (least, True)):
+        record.add_final(final(TRUTH.take(slice(None, 100 * poses, 100)), "odom"))
+        figures = judge(record, TRUTH, alignment=alignment).figures
+        assert ("final_ate_rmse_m" in figures) == judged_
+        if not judged_:
+            expected = f"expected at least {least} poses to align by {alignment}, found {count}"
+            assert figures["why_not_final"] == expected
+
+
+def test_poses_without_truth_are_counted_in_a_note() -> None:
+    early = Trajectory(TRUTH.stamps - 5 * SECOND, TRUTH.positions, TRUTH.orientations)
+    judgement = judged(final(early))
+    before = int(np.count_nonzero(early.stamps < TRUTH.stamps[0]))
+    assert judgement.figures["final_poses"] == 600
+    assert f"{before} of its 600 poses have no truth" in judgement.note
 
 
 def test_another_frame_is_aligned_by_its_own_first_pose() -> None:

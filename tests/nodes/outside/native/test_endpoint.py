@@ -17,12 +17,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from events.geometry import inverse, pose_matrix
-from nodes.outside.native import LinkError, endpoint
+from nodes.outside.native import LinkError, LinkTrajectory, endpoint
 from nodes.outside.native.client import RECORDS, Frame, Link
 from tests.nodes.outside.native.samples_link import (
     CAMERA,
     LIMIT,
     Noted,
+    Raw,
     images,
     listening,
     pose,
@@ -313,6 +314,24 @@ def test_ready_promises_a_trajectory_or_none(run: Noted) -> None:
         run.endpoint.finish(LIMIT)
 
 
+def finished(
+    run: Noted, raw: Raw, *messages: tuple[int, bytes], seconds: float = LIMIT
+) -> LinkTrajectory:
+    """Finish a program that answers BYE with messages."""
+
+    def reply() -> None:
+        assert raw.receive() == (5, b"")
+        for message in messages:
+            raw.send(*message)
+
+    replying = threading.Thread(target=reply)
+    replying.start()
+    try:
+        return run.endpoint.finish(seconds)
+    finally:
+        replying.join()
+
+
 @pytest.mark.parametrize("pose_of", [0, 1])
 @pytest.mark.parametrize("answered", [False, True])
 def test_the_trajectory_is_in_the_frame_of_the_poses_before_it(
@@ -329,9 +348,7 @@ def test_the_trajectory_is_in_the_frame_of_the_poses_before_it(
         raw.receive()
         raw.send(*((32, pose(0, 0, said[1])) if answered else (33, struct.pack("<Qq", 0, 0))))
         run.answer()
-        raw.send(36, stamped_poses({7: said[0], 8: said[2]}))
-        trajectory = run.endpoint.finish(LIMIT)
-        assert raw.receive() == (5, b"")
+        trajectory = finished(run, raw, (36, stamped_poses({7: said[0], 8: said[2]})))
     assert trajectory.stamps.tolist() == [7, 8]
     origin = inverse(cameras[1 if answered else 0])
     for found, camera in zip(trajectory.poses, (cameras[0], cameras[2]), strict=True):
@@ -342,7 +359,7 @@ def test_the_trajectory_is_in_the_frame_of_the_poses_before_it(
 @pytest.mark.parametrize(
     ("message", "reason"),
     [
-        (None, "none within 0.05 s"),
+        (None, "none yet"),
         ((5, b"no map"), "it said goodbye no map"),
         ((36, bytes(105)), "TRAJECTORY: expected 104 bytes a pose, found 105 in all"),
     ],
@@ -353,27 +370,28 @@ def test_a_trajectory_that_does_not_come_is_an_error_with_the_reason(
     with program(run.path) as raw:
         raw.get_ready(promises=True)
         run.endpoint.wait(LIMIT)
-
-        def reply() -> None:
-            assert raw.receive() == (5, b"")
-            if message is not None:
-                raw.send(*message)
-
-        replying = threading.Thread(target=reply)
-        replying.start()
+        messages = [message] if message else []
         with pytest.raises(LinkError, match=f"raw: expected its trajectory, found {reason}"):
-            run.endpoint.finish(0.05 if message is None else LIMIT)
-        replying.join()
+            finished(run, raw, *messages, seconds=LIMIT if messages else 0.05)
     assert run.gone.empty()
 
 
-def test_a_second_trajectory_breaks_the_protocol(run: Noted) -> None:
+def test_a_trajectory_before_the_end_breaks_the_protocol(run: Noted) -> None:
     with program(run.path) as raw:
         raw.get_ready(promises=True)
         run.endpoint.wait(LIMIT)
         raw.send(36)
-        raw.send(36)
-        assert "TRAJECTORY: expected one, found a second" in run.reason()
+        assert "TRAJECTORY: expected it after the run's BYE, found it before" in run.reason()
+
+
+def test_a_second_trajectory_is_logged_and_the_first_counts(run: Noted) -> None:
+    with program(run.path) as raw:
+        raw.get_ready(promises=True)
+        run.endpoint.wait(LIMIT)
+        first = stamped_poses({1: np.eye(4)})
+        assert finished(run, raw, (36, first), (36, b"")).stamps.tolist() == [1]
+        expected = "after the run: TRAJECTORY: expected one, found a second"
+        assert run.logs.get(timeout=LIMIT) == expected
 
 
 @pytest.mark.parametrize("of", [0, 1])

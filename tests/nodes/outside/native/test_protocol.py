@@ -236,6 +236,7 @@ def test_what_is_wrong_is_named(body: bytes, named: str) -> None:
         (bytes(103), "TRAJECTORY: expected 104 bytes a pose, found 103 in all"),
         (stamped_poses({5: np.eye(4), 4: np.eye(4)}), "rise strictly, found 4 after 5"),
         (stamped_poses({4: np.eye(4)}) * 2, "rise strictly, found 4 after 4"),
+        (stamped_poses({2**63 - 1: np.eye(4), -(2**63): np.eye(4)}), "rise strictly"),
         (stamped_poses({4: np.eye(4), 5: np.full((4, 4), np.inf)}), "pose: expected finite"),
         (stamped_poses({4: np.eye(4), 5: np.zeros((4, 4))}), "pose: expected a rotation"),
         (stamped_poses({4: np.full((4, 4), 1e10), 5: np.eye(4)}), "pose: expected at most"),
@@ -244,6 +245,13 @@ def test_what_is_wrong_is_named(body: bytes, named: str) -> None:
 def test_a_wrong_trajectory_is_named(body: bytes, named: str) -> None:
     with pytest.raises(LinkError, match=rf"TRAJECTORY.*{named}" if named[0].islower() else named):
         read_trajectory(bytearray(body))
+
+
+def test_a_client_sends_no_trajectory_that_it_has_not_promised(tmp_path: Path) -> None:
+    with listening(tmp_path / "s") as run, Link("x", str(run.path)) as link:
+        link.ready()
+        with pytest.raises(ProtocolError, match=r"expected ready\(trajectory=True\) before"):
+            link.trajectory([1], [np.eye(4)])
 
 
 @QUICK

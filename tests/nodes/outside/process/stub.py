@@ -113,6 +113,8 @@ def main() -> None:
             poses = np.tile(np.eye(4), (len(stamps), 1, 1))
             poses[:, 0, 3], poses[:, 2, 3] = np.arange(len(stamps)), 1.0
             link.trajectory(stamps, poses)
+        elif modes.get("corrects") == "elsewhere":
+            link.trajectory([stamps[0], stamps[1] + 5], np.tile(np.eye(4), (2, 1, 1)))
         elif modes.get("corrects") == "empty":
             link.trajectory([], np.empty((0, 4, 4)))
     if "deaf" in modes:
