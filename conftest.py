@@ -9,6 +9,7 @@ import gc
 import os
 import signal
 from collections.abc import Generator
+from functools import cache
 
 import pytest
 from hypothesis import settings
@@ -41,6 +42,16 @@ def pytest_collection() -> Generator[None, object, object]:
     finally:
         gc.enable()
         gc.freeze()
+
+
+def pytest_collection_finish() -> None:
+    """Ask git once for the commit that the summary of each run has: two processes a run otherwise.
+
+    The tests of the commit itself, which have imported the function by now, ask each time.
+    """
+    from runtime import commit  # after the environment above
+
+    pytest.MonkeyPatch().setattr(commit, "of_repository", cache(commit.of_repository))
 
 
 # Objects are made and dropped by the million: the usual 700 between collections are too few.

@@ -14,6 +14,12 @@ from runtime.commit import commit, of_repository
 HASH = "[0-9a-f]{7,40}"
 
 
+@pytest.fixture(autouse=True)
+def _ask_each_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other tests share one answer of git."""
+    monkeypatch.setattr(module, "of_repository", of_repository)
+
+
 def repository(folder: Path, *files: str) -> None:
     """Make a repository with files."""
     folder.mkdir(parents=True, exist_ok=True)
