@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 from events import (
     EstimatorAnnouncement,
@@ -32,7 +33,12 @@ def heading(stamp: int) -> tuple[float, float, float, float]:
 
 def truth(seconds: float) -> list[Event]:
     """200 Hz of truth."""
-    return [
+    return list(_truth(seconds))
+
+
+@cache
+def _truth(seconds: float) -> tuple[Event, ...]:
+    return tuple(
         Odometry(
             stamp=stamp,
             source="drone",
@@ -42,7 +48,7 @@ def truth(seconds: float) -> list[Event]:
             angular_velocity=(0.0, 0.0, 0.0),
         )
         for stamp in range(0, round(seconds * SECOND) + 1, 5 * MS)
-    ]
+    )
 
 
 def estimate(

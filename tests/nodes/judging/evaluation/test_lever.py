@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ def attitude(stamp: int) -> tuple[float, float, float, float]:
     return float(w), float(x), float(y), float(z)
 
 
+@cache
 def truth(duration: float) -> list[Event]:
     return [
         msgspec.structs.replace(event, orientation=attitude(event.stamp))
