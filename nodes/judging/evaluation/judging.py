@@ -505,8 +505,6 @@ def _judge_final(
     offset = best_time_offset(truth, final, with_scale=how == "sim3")
     if offset is not None:
         notes.append(offset.text())
-    if len(estimated) < len(final):
-        notes.append(f"{len(final) - len(estimated)} of its {len(final)} poses have no truth")
     note = "; ".join(filter(None, notes))
     return moved.moved(-lever), f"after loop closures: {note}" if note else ""
 

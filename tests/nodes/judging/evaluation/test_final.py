@@ -117,14 +117,6 @@ def test_fewer_poses_than_an_alignment_needs_have_no_error_of_zero(
             assert figures["why_not_final"] == expected
 
 
-def test_poses_without_truth_are_counted_in_a_note() -> None:
-    early = Trajectory(TRUTH.stamps - 5 * SECOND, TRUTH.positions, TRUTH.orientations)
-    judgement = judged(final(early))
-    before = int(np.count_nonzero(early.stamps < TRUTH.stamps[0]))
-    assert judgement.figures["final_poses"] == 600
-    assert f"{before} of its 600 poses have no truth" in judgement.note
-
-
 def test_another_frame_is_aligned_by_its_own_first_pose() -> None:
     elsewhere = moved(TRUTH)
     assert judged(final(elsewhere, "odom")).figures["final_ate_rmse_m"] < 1e-6
