@@ -2,9 +2,11 @@
 //
 // It answers with the pose of the camera in DSO's world, whose unit of length is arbitrary, and at the end
 // gives those of the keyframes after all optimizations, which DSO itself writes as its result. All is
-// computed in the caller's thread, one frame after the other. Images of a lens are rectified. The argument is DSO's own: `mode=2`, if
-// there is none, takes images as perfect (one exposure, no vignette, little noise); `mode=1` is for cameras
-// without photometric calibration, as EuRoC's, and estimates the brightness of each frame.
+// computed in the caller's thread, one frame after the other. Images of a lens are rectified.
+//
+// The argument is DSO's own: `mode=2`, if there is none, takes images as perfect (one exposure, no
+// vignette, little noise); `mode=1` is for cameras without photometric calibration, as EuRoC's, and
+// estimates the brightness of each frame.
 #define BOOST_BIND_GLOBAL_PLACEHOLDERS  // which DSO's headers use
 #include <boost/bind.hpp>
 
