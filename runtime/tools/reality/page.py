@@ -205,7 +205,7 @@ def _error(result: Result, study: Study) -> float:
 
 
 def ablations(study: Study, count: Mapping[Run, Result]) -> dict[str, dict[str, str]]:
-    """Return by condition and system the error divided by that under ``real``, in words."""
+    """Return by condition and system the error divided by that under `Part.against`, in words."""
     errors: dict[str, dict[str, dict[Hashable, float]]] = {}
     for run, result in count.items():
         place = run.sequence, run.world, run.seed
@@ -215,7 +215,7 @@ def ablations(study: Study, count: Mapping[Run, Result]) -> dict[str, dict[str, 
         condition.name: {
             name: f"× {ratio:.2g} ({runs})"
             for name, (ratio, runs) in agreement.ablation(
-                errors[condition.name], errors.get(REAL, {})
+                errors[condition.name], errors.get(condition.against, {})
             ).items()
         }
         for condition in study.conditions

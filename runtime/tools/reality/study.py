@@ -55,11 +55,14 @@ class Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         worlds: Worlds flown in with it; all if empty.
         seeds: Flights of a sequence, if not that of the command.
         scan: Whether it is the world given by ``--outside``.
-        why_not: Why results in this world are reported and not counted; empty if they are counted.
+        why_not: Why results in this world, or under this condition, are reported and not counted;
+            empty if they are counted.
+        against: Condition that this one is compared with.
     """
 
     name: str
     shows: str = ""
+    against: str = REAL
     set: tuple[str, ...] = ()
     sequences: tuple[str, ...] = ()
     worlds: tuple[str, ...] = ()
