@@ -24,6 +24,7 @@ from runtime.tools.reality.study import (
     Published,
     Run,
     Study,
+    System,
     keys_of,
     make_plan,
     read_published,
@@ -211,15 +212,17 @@ def ablations(study: Study, count: Mapping[Run, Result]) -> dict[str, dict[str, 
         place = run.sequence, run.world, run.seed
         by_place = errors.setdefault(run.condition, {}).setdefault(run.system, {})
         by_place[place] = _error(result, study)
-    return {
-        condition.name: {
-            name: f"× {ratio:.2g} ({runs})"
-            for name, (ratio, runs) in agreement.ablation(
-                errors[condition.name], errors.get(condition.against, {})
-            ).items()
-        }
+    ratios = {
+        condition.name: agreement.ablation(
+            errors[condition.name], errors.get(condition.against, {})
+        )
         for condition in study.conditions
-        if condition.name != REAL and condition.name in errors
+        if condition.name in errors and condition.name != condition.against
+    }
+    return {
+        condition: {name: f"× {ratio:.2g} ({runs})" for name, (ratio, runs) in row.items()}
+        for condition, row in ratios.items()
+        if row
     }
 
 
@@ -235,6 +238,17 @@ def differing(study: Study, count: Mapping[Run, Result]) -> list[str]:
         for flight, flight_digests in digests.items()
         if len(flight_digests) > 1
     ]
+
+
+def _comparable(
+    table: Mapping[str, Mapping[Cell, Group]], systems: Mapping[str, System]
+) -> dict[str, dict[Cell, float]]:
+    """Return the errors of the systems that count."""
+    return {
+        name: {cell: group.error for cell, group in row.items()}
+        for name, row in table.items()
+        if not systems[name].why_not
+    }
 
 
 def _in_world(
@@ -285,9 +299,10 @@ def write_page(
     systems = {system.name: system for system in study.systems}
     real = published.errors()
     errors = {name: real[s.published] for name, s in systems.items() if s.published}
-    table = groups(study, count)
-    simulated = {name: {c: g.error for c, g in row.items()} for name, row in table.items()}
-    of_systems = {name: row for name, row in simulated.items() if not systems[name].why_not}
+    conditions = [c for c in study.conditions if c.name == REAL or c.why_not]
+    tables = {c.name: groups(study, count, c.name) for c in conditions}
+    comparable = {name: _comparable(table, systems) for name, table in tables.items()}
+    of_systems = comparable[REAL]
     left_out = {world.name for world in study.worlds if world.why_not}
     counted = {
         name: {cell: error for cell, error in row.items() if cell.world not in left_out}
@@ -298,10 +313,15 @@ def write_page(
     labels = {name: systems[name].published for name in counted}
     worlds = [world.name for world in study.worlds]
     drawn = draw(of_systems, errors, labels, worlds, folder / "scatter.svg")
-    flown = [w for w in worlds if any(c.world == w for row in table.values() for c in row)]
+    flown = [
+        (world, name)
+        for name, table in tables.items()
+        for world in worlds
+        if any(cell.world == world for row in table.values() for cell in row)
+    ]
     all_criteria = agreement.criteria(counted, errors)
-    criteria_by_world = [
-        agreement.criteria(_in_world(of_systems, world), errors) for world in flown
+    criteria_by_place = [
+        agreement.criteria(_in_world(comparable[name], world), errors) for world, name in flown
     ]
     text = template(FOLDER / "REALITY.md.jinja").render(
         command=command,
@@ -310,13 +330,18 @@ def write_page(
         whole=len(keys),
         criteria=all_criteria,
         flown=flown,
-        by_world=[(c[0].name, c[1:]) for c in zip(all_criteria, *criteria_by_world, strict=True)],
+        by_place=[(c[0].name, c[1:]) for c in zip(all_criteria, *criteria_by_place, strict=True)],
         inverted=agreement.inversions(counted, errors)[0],
-        rankings=agreement.rankings(of_systems, errors),
+        rankings=[
+            (name, ranking)
+            for name, row in comparable.items()
+            for ranking in agreement.rankings(row, errors)
+        ],
         levels=agreement.levels(counted, errors),
         systems=systems,
         counted=counted,
-        table=table,
+        tables=tables,
+        conditions={condition.name: condition for condition in conditions},
         published=errors,
         sources=[t for t in published.tables if {*t.rows} & {s.published for s in study.systems}],
         ablations=ablations(study, count),
@@ -331,6 +356,7 @@ def write_page(
         differing=differing(study, count),
         commits=Counter(result.commit or "unknown" for result in count.values()),
         Cell=Cell,
+        REAL=REAL,
         word=lambda value: "failed" if math.isinf(value) else f"{value:.3f}",
     )
     write(path, (text.rstrip() + "\n").encode())

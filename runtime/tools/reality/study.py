@@ -163,6 +163,13 @@ class Published(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 def read_study(path: Path = FOLDER / "study.toml") -> Study:
     """Read a study; raise `ConfigError` if something in it is wrong."""
     study = _read(path, Study)
+    names = [condition.name for condition in study.conditions]
+    for condition in study.conditions:
+        message = (
+            f"{path}: condition {condition.name}: against: expected one of {', '.join(names)}, "
+            f"found {condition.against}"
+        )
+        expect_known(condition.against, names, message, ConfigError)
     return msgspec.structs.replace(study, rig=str(path.resolve().parent / study.rig))
 
 

@@ -26,7 +26,7 @@ PUBLISHED = read_published().errors()
 @functools.cache
 def part() -> Study:
     """Return a part of the project's own study, with all systems."""
-    sequences, conditions = ["V1_01", "V1_02", "V1_03"], ["real", "exact"]
+    sequences, conditions = ["V1_01", "V1_02", "V1_03"], ["real", "steady", "exact"]
     return read_study().only(sequences=sequences, worlds=["poor", "rich"], conditions=conditions)
 
 
@@ -97,7 +97,7 @@ def test_a_page_of_all_results_has_each_criterion(study: Study, tmp_path: Path) 
     assert re.search(r"\| level \| 1 in the median of \d+ \|.*\| passed \|", text)
     assert "| 0.035 / 0.035 |" in text
     assert "no: it was developed with this simulator" in text
-    assert "| dso | × 1 (10) |" in text
+    assert re.search(r"\| dso \| × 1 \(\d+\) \| × 1 \(10\) \|", text)
     assert f"`c0ffee` ({len(count)})" in text
     assert "different bytes" not in text
 
@@ -129,7 +129,7 @@ def test_a_condition_may_be_flown_with_some_systems(study: Study, tmp_path: Path
     of_all = made_up(study)
     part = {run: r for run, r in of_all.items() if run.condition == "real" or run.system == "dso"}
     text = page(study, part, tmp_path)
-    assert "| dso | × 1 (10) |" in text
+    assert re.search(r"\| dso \| × 1 \(\d+\) \| × 1 \(10\) \|", text)
     assert "| basalt | × " not in text
 
 
@@ -150,6 +150,35 @@ def test_a_world_that_is_not_counted_is_shown_with_the_reason(study: Study, tmp_
     heading = f"## {first.name}: {first.shows}\n\n**Reported, not counted**: it is unlike the real"
     assert heading in text
     assert re.search(r"\| level \| .*: failed \| 1 in the median of \d+: passed \|", text)
+
+
+def test_a_condition_that_is_not_counted_is_shown_with_the_reason(
+    study: Study, tmp_path: Path
+) -> None:
+    """Nothing agrees under it; what counts does not change, and it has columns and tables."""
+    count = made_up(study)
+    for run, result in count.items():
+        if run.condition == "steady":
+            count[run] = changed(result, ate_m=100.0 / (result.ate_m or 1.0), final_ate_m=None)
+    text = page(study, count, tmp_path)
+    assert re.search(r"\| ranking of systems \| Spearman 1\.00, .* passed \|", text)
+    assert "| criterion | poor | rich | poor, steady | rich, steady |" in text
+    assert re.search(r"\| V1_01 \| poor \| steady \| \d \| -?0\.\d\d \|", text)
+    assert re.search(r"\| V1_01 \| poor \| real \| \d \| 1\.00 \|", text)
+    assert text.count("\n\nUnder `steady`, **reported, not counted**: no camera in a room") == 2
+    assert "| 2500.000 / 0.040 |" in text.split("Under `steady`")[1]
+
+
+def test_a_condition_is_compared_with_the_one_that_it_names(study: Study, tmp_path: Path) -> None:
+    count = made_up(study)
+    for run, result in count.items():
+        if run.condition == "steady":
+            count[run] = changed(result, ate_m=2.0, final_ate_m=2.0)
+        if run.condition == "exact":
+            count[run] = changed(result, ate_m=1.0, final_ate_m=1.0)
+    text = page(study, count, tmp_path)
+    assert "| system | steady / real | exact / steady |" in text
+    assert re.search(r"\| dso \| × [^|]* \| × 0\.5 \(10\) \|", text)
 
 
 def test_what_went_wrong_is_on_the_page(study: Study, tmp_path: Path) -> None:

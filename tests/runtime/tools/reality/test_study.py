@@ -176,6 +176,12 @@ def test_a_row_with_a_word_too_few_is_refused(tmp_path: Path) -> None:
         read_published(tmp_path / "p.toml").errors()
 
 
+def test_a_condition_against_one_that_is_not_there_is_refused(small: Path) -> None:
+    small.write_text(STUDY.replace('name = "sharp"', 'name = "sharp"\nagainst = "raal"'))
+    with pytest.raises(ConfigError, match=r"condition sharp: against: expected one of real, sharp"):
+        read_study(small)
+
+
 def test_runs_that_say_most_come_first(small: Path) -> None:
     study = read_study(small).only(systems=["good"])
     assert names(study) == [
