@@ -287,7 +287,7 @@ class Endpoint:
                 lambda: program.trajectory or program.gone or self._closed, seconds
             )
             if program.trajectory is None:
-                found = program.end_reason or "none yet"
+                found = program.end_reason or f"none within its grace of {seconds:.2g} s"
                 raise LinkError(f"{program.name}: expected its trajectory, found {found}")
             return program.trajectory
 

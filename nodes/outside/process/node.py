@@ -391,7 +391,7 @@ class Process(Estimator[ProcessConfig]):
         try:
             trajectory = await self.offload(self._feed.finish, grace)
         except LinkError as error:
-            story = await self.offload(self._story, f"{error}, within {grace:g} s (grace)")
+            story = await self.offload(self._story, str(error))
             if self.config.hold.on_missing == "error":
                 raise ProgramError(story) from None
             self.log.warning("%s", story)

@@ -172,8 +172,8 @@ def test_a_trajectory_alone_starts_where_the_vehicle_was_then(tmp_path: Path) ->
 
 
 NO_TRAJECTORY = {
-    "never": r"expected its trajectory, found it said goodbye, within 0\.5 s \(grace\); .* ended",
-    "empty": r"expected its trajectory, found an empty one, within",
+    "never": r"expected its trajectory, found it said goodbye; .* ended",
+    "empty": r"expected its trajectory, found an empty one",
     "elsewhere": r"TRAJECTORY\.stamp: expected stamps of frames, found 33333338 \(1 of 2 are",
 }
 
