@@ -62,7 +62,7 @@ mavproxy: .venv-mavproxy/.ready  ## Install MAVProxy (GPL) in an environment of 
 test-slow: $(READY) .venv-mavproxy/.ready  ## Run the slow tests; what fails is repeated once, alone.
 	@sh tools/system_packages.sh display
 	@sh tools/system_packages.sh arm
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m slow || { \
+	$(BIN)/python -m pytest -n 3 --dist loadfile -m slow || { \
 		echo "Repeated once, alone, is what failed above:"; \
 		$(BIN)/python -m pytest --last-failed --last-failed-no-failures none -m slow; }
 
