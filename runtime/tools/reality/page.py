@@ -5,21 +5,21 @@ from __future__ import annotations
 import math
 import statistics
 from collections import Counter
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Container, Hashable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
 import typer
 
+from runtime.errors import CommandError
 from runtime.run.results import write
 from runtime.tools.reality import agreement
-from runtime.tools.reality.agreement import Cell
+from runtime.tools.reality.agreement import Cell, Criterion
 from runtime.tools.reality.plot import draw
 from runtime.tools.reality.results import Ledger, Result, result_of
 from runtime.tools.reality.study import (
     FOLDER,
-    REAL,
     Planned,
     Published,
     Run,
@@ -85,7 +85,10 @@ def reality(
     from runtime.run.summarise import command_line
     from runtime.tools.cli.sweep import carry_out
 
+    if plan and not truth:
+        raise CommandError("--plan: expected --truth, the folder of the ground truth, found none")
     full_study, published = read_study(file) if file else read_study(), read_published()
+    published.by_system(full_study)
     study = full_study.only(
         sequences=_names(sequences),
         worlds=_names(worlds),
@@ -94,6 +97,11 @@ def reality(
     )
     out, ledger = out.absolute(), Ledger(results)
     keys = keys_of(study, seeds) if truth else {}
+    if truth and not keys:
+        raise CommandError(
+            "expected --sequences, --worlds and --conditions that the study flies together, "
+            "found none"
+        )
     planned = make_plan(
         study,
         keys,
@@ -182,7 +190,7 @@ class Group(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def groups(
-    study: Study, count: Mapping[Run, Result], condition: str = REAL
+    study: Study, count: Mapping[Run, Result], condition: str
 ) -> dict[str, dict[Cell, Group]]:
     """Return the results under a condition by system and cell, in the order of the study."""
     table: dict[str, dict[Cell, Group]] = {}
@@ -214,13 +222,13 @@ def ablations(study: Study, count: Mapping[Run, Result]) -> dict[str, dict[str, 
         by_place[place] = _error(result, study)
     ratios = {
         condition.name: agreement.ablation(
-            errors[condition.name], errors.get(condition.against, {})
+            errors[condition.name], errors.get(condition.against or study.conditions[0].name, {})
         )
-        for condition in study.conditions
-        if condition.name in errors and condition.name != condition.against
+        for condition in study.conditions[1:]
+        if condition.name in errors
     }
     return {
-        condition: {name: f"× {ratio:.2g} ({runs})" for name, (ratio, runs) in row.items()}
+        condition: {name: f"× {ratio:.3g} ({runs})" for name, (ratio, runs) in row.items()}
         for condition, row in ratios.items()
         if row
     }
@@ -297,29 +305,40 @@ def write_page(
         old: The stale ones.
     """
     systems = {system.name: system for system in study.systems}
-    real = published.errors()
-    errors = {name: real[s.published] for name, s in systems.items() if s.published}
-    conditions = [c for c in study.conditions if c.name == REAL or c.why_not]
-    tables = {c.name: groups(study, count, c.name) for c in conditions}
+    errors = published.by_system(study)
+    judged = [*study.conditions[:1], *(c for c in study.conditions[1:] if c.judged)]
+    tables = {condition.name: groups(study, count, condition.name) for condition in judged}
     comparable = {name: _comparable(table, systems) for name, table in tables.items()}
-    of_systems = comparable[REAL]
     left_out = {world.name for world in study.worlds if world.why_not}
     counted = {
-        name: {cell: error for cell, error in row.items() if cell.world not in left_out}
-        for name, row in of_systems.items()
+        condition: {
+            name: {cell: error for cell, error in row.items() if cell.world not in left_out}
+            for name, row in table.items()
+        }
+        for condition, table in comparable.items()
     }
+    failed = {
+        condition: {name: agreement.failing_cells(row) for name, row in table.items()}
+        for condition, table in comparable.items()
+    }
+    failed_in_reality = {name: agreement.failing(row) for name, row in errors.items()}
     folder = path.parent / path.stem.lower()
     folder.mkdir(parents=True, exist_ok=True)
-    labels = {name: systems[name].published for name in counted}
     worlds = [world.name for world in study.worlds]
-    drawn = draw(of_systems, errors, labels, worlds, folder / "scatter.svg")
+    first = judged[0].name
+    drawn = draw(
+        comparable[first],
+        errors,
+        {name: system.published for name, system in systems.items() if system.published},
+        worlds,
+        folder / "scatter.svg",
+    )
     flown = [
         (world, name)
         for name, table in tables.items()
         for world in worlds
         if any(cell.world == world for row in table.values() for cell in row)
     ]
-    all_criteria = agreement.criteria(counted, errors)
     criteria_by_place = [
         agreement.criteria(_in_world(comparable[name], world), errors) for world, name in flown
     ]
@@ -328,20 +347,27 @@ def write_page(
         study=study,
         finished=sum(run in count for run in keys),
         whole=len(keys),
-        criteria=all_criteria,
+        judged=judged,
+        criteria=_in_rows([agreement.criteria(counted[c.name], errors) for c in judged]),
+        extents=[_extent(c.name, count, counted[c.name], left_out) for c in judged],
         flown=flown,
-        by_place=[(c[0].name, c[1:]) for c in zip(all_criteria, *criteria_by_place, strict=True)],
-        inverted=agreement.inversions(counted, errors)[0],
+        by_place=_in_rows(criteria_by_place),
+        inverted=[(c.name, agreement.inversions(counted[c.name], errors)[0]) for c in judged],
         rankings=[
             (name, ranking)
             for name, row in comparable.items()
             for ranking in agreement.rankings(row, errors)
         ],
-        levels=agreement.levels(counted, errors),
+        in_both=[
+            (c.name, pair)
+            for c in judged[1:]
+            for pair in _in_both(comparable[first], comparable[c.name], errors)
+        ],
         systems=systems,
-        counted=counted,
+        counting=[name for name, system in systems.items() if not system.why_not],
         tables=tables,
-        conditions={condition.name: condition for condition in conditions},
+        failed=failed,
+        failed_in_reality=failed_in_reality,
         published=errors,
         sources=[t for t in published.tables if {*t.rows} & {s.published for s in study.systems}],
         ablations=ablations(study, count),
@@ -356,7 +382,44 @@ def write_page(
         differing=differing(study, count),
         commits=Counter(result.commit or "unknown" for result in count.values()),
         Cell=Cell,
-        REAL=REAL,
         word=lambda value: "failed" if math.isinf(value) else f"{value:.3f}",
     )
     write(path, (text.rstrip() + "\n").encode())
+
+
+def _in_both(
+    first: agreement.Simulated, other: agreement.Simulated, published: agreement.Published
+) -> list[tuple[agreement.Ranking, agreement.Ranking]]:
+    """Return the rankings under two conditions, of the systems that were flown under both."""
+    tables = [
+        {name: {c: e for c, e in row.items() if c in b.get(name, {})} for name, row in a.items()}
+        for a, b in ((first, other), (other, first))
+    ]
+    of_first, of_other = (
+        {ranking.cell: ranking for ranking in agreement.rankings(table, published)}
+        for table in tables
+    )
+    return [(ranking, of_other[cell]) for cell, ranking in of_first.items() if cell in of_other]
+
+
+def _in_rows(columns: Sequence[Sequence[Criterion]]) -> list[tuple[Criterion, ...]]:
+    """Return the criteria of several tables, those of one name together."""
+    return [*zip(*columns, strict=True)] if columns else []
+
+
+def _extent(
+    condition: str,
+    count: Mapping[Run, Result],
+    counted: Mapping[str, Mapping[Cell, float]],
+    left_out: Container[str],
+) -> str:
+    """Return how much counts under a condition, in words."""
+    runs = [
+        run
+        for run in count
+        if run.condition == condition and run.system in counted and run.world not in left_out
+    ]
+    kinds = ("system", "sequence", "world", "seed")
+    amounts = [(len({getattr(run, kind) for run in runs}), kind) for kind in kinds]
+    words = [f"{amount} {kind}{'s' * (amount != 1)}" for amount, kind in amounts]
+    return f"{len(runs)} runs: {', '.join(words)}" if runs else "none yet"

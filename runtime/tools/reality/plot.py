@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from runtime.tools.reality.agreement import NEAR, Cell, Published, Simulated
+from runtime.tools.reality.agreement import (
+    NEAR,
+    Cell,
+    Published,
+    Simulated,
+    failing,
+    failing_cells,
+)
 
 MARKS = "os^Dv*Xp"
 FAILED = 3.0  # m, where failures are drawn
@@ -46,7 +52,7 @@ def draw(
                 "ls": "",
             }
             at = [min(value, FAILED) for value in (real, sim)]
-            failed = math.isinf(sim) or math.isinf(real)
+            failed = failing_cells(simulated[name])[cell] or failing(published[name])[cell.sequence]
             axes.plot(*at, **look, fillstyle="none" if failed else "full", clip_on=False)
             axes.annotate(cell.sequence, at, fontsize=5, xytext=(3, 2), textcoords="offset points")
             handles[labels[name]] = axes.plot([], [], **look)[0]

@@ -29,7 +29,6 @@ from runtime.tools.sweep.plan import Job, make_job
 T = TypeVar("T")
 
 FOLDER = Path(__file__).parent
-REAL = "real"  # the condition that the others are compared with
 RATE = 20.0  # of the rig's cameras, for estimates of processor time
 REST = 2.5  # s, before the motion
 
@@ -55,14 +54,15 @@ class Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         worlds: Worlds flown in with it; all if empty.
         seeds: Flights of a sequence, if not that of the command.
         scan: Whether it is the world given by ``--outside``.
-        why_not: Why results in this world, or under this condition, are reported and not counted;
-            empty if they are counted.
-        against: Condition that this one is compared with.
+        why_not: Why results in this world are reported and not counted; empty if they are counted.
+        judged: Whether agreement is judged under this condition, as it is under the first.
+        against: Condition that this one is compared with; the first if empty.
     """
 
     name: str
     shows: str = ""
-    against: str = REAL
+    judged: bool = False
+    against: str = ""
     set: tuple[str, ...] = ()
     sequences: tuple[str, ...] = ()
     worlds: tuple[str, ...] = ()
@@ -100,11 +100,14 @@ class Study(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         rig: Path of the file of the carried rig; in the file relative to it.
         coverage_percent: Share of the images with a pose below which a system has failed.
         frame_ms: Processor time of a frame of the flight itself, for the estimate.
+        remarks: Sections of the page before its verdicts, Markdown: what the study does not show,
+            and what was decided when.
     """
 
     rig: str
     coverage_percent: float
     frame_ms: float
+    remarks: str = ""
     sequences: tuple[Part, ...]
     worlds: tuple[Part, ...]
     conditions: tuple[Part, ...]
@@ -159,18 +162,53 @@ class Published(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
                 rows[row] = {n: math.inf if w == "x" else float(w) for n, w in pairs if w != "-"}
         return rows
 
+    def by_system(self, study: Study) -> dict[str, dict[str, float]]:
+        """Return errors (m) by the system, of those that have a row, and sequence.
+
+        Raises:
+            ConfigError: A system names a row that is not there.
+        """
+        rows = self.errors()
+        named = {system.name: system.published for system in study.systems if system.published}
+        for name, row in named.items():
+            expected = f"{name}: published: expected a row of published.toml, found {row}"
+            expect_known(row, rows, expected, ConfigError)
+        return {name: rows[row] for name, row in named.items()}
+
 
 def read_study(path: Path = FOLDER / "study.toml") -> Study:
     """Read a study; raise `ConfigError` if something in it is wrong."""
     study = _read(path, Study)
-    names = [condition.name for condition in study.conditions]
-    for condition in study.conditions:
-        message = (
-            f"{path}: condition {condition.name}: against: expected one of {', '.join(names)}, "
-            f"found {condition.against}"
-        )
-        expect_known(condition.against, names, message, ConfigError)
+    _check(study, path)
     return msgspec.structs.replace(study, rig=str(path.resolve().parent / study.rig))
+
+
+def _check(study: Study, path: Path) -> None:
+    """Raise `ConfigError` if a name stands twice, or one that is spoken of does not stand there."""
+    kinds: dict[str, tuple[Part | System, ...]] = {
+        "sequences": study.sequences,
+        "worlds": study.worlds,
+        "conditions": study.conditions,
+        "systems": study.systems,
+    }
+    for kind, parts in kinds.items():
+        counts = Counter(part.name for part in parts)
+        if twice := [name for name, count in counts.items() if count > 1]:
+            raise ConfigError(f"{path}: {kind}: expected each name once, found twice {twice[0]}")
+        if not parts:
+            raise ConfigError(f"{path}: {kind}: expected at least one, found none")
+    for part in (*study.worlds, *study.conditions):
+        spoken_of = {"sequences": part.sequences, "worlds": part.worlds}
+        if part.against:
+            spoken_of["conditions"] = (part.against,)
+        for kind, selected in spoken_of.items():
+            names = [other.name for other in kinds[kind]]
+            for name in selected:
+                field = "against" if kind == "conditions" else kind
+                message = (
+                    f"{path}: {part.name}: {field}: expected of {', '.join(names)}, found {name}"
+                )
+                expect_known(name, names, message, ConfigError)
 
 
 def read_published(path: Path = FOLDER / "published.toml") -> Published:

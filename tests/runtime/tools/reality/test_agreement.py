@@ -19,6 +19,7 @@ from runtime.tools.reality.agreement import (
     difficulty,
     exact_p,
     failing,
+    failing_cells,
     failures,
     inversions,
     levels,
@@ -101,6 +102,26 @@ def test_fewer_than_six_systems_are_not_enough() -> None:
     assert verdicts({}) == dict.fromkeys(verdicts({}), "nothing to compare") | {
         "ranking of systems": "not enough systems"
     }
+
+
+def test_fewer_than_three_rankings_are_not_enough() -> None:
+    """Smaller ones are left out of the median, and counted."""
+    two = {
+        n: {c: e for c, e in row.items() if c.sequence in "12" or n not in "ef"}
+        for n, row in simulated().items()
+    }
+    ranking = criteria(two, REAL)[0]
+    assert ranking.verdict == "not enough sequences"
+    assert (
+        ranking.figure == "Spearman 1.00, median of 2 rankings of 6 systems (2 of fewer left out)"
+    )
+
+
+def test_a_system_fails_by_its_own_median_in_each_world() -> None:
+    errors = {Cell(s, "w"): e for s, e in zip("12345", (1, 1, 1, 6, math.inf), strict=True)}
+    errors |= {Cell("1", "v"): 9.0, Cell("2", "v"): math.inf}
+    failed = [cell for cell, is_failure in failing_cells(errors).items() if is_failure]
+    assert failed == [Cell("4", "w"), Cell("5", "w"), Cell("2", "v")]
 
 
 def test_only_what_both_know_is_ranked() -> None:

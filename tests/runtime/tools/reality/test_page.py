@@ -92,9 +92,13 @@ def test_a_page_of_all_results_has_each_criterion(study: Study, tmp_path: Path) 
     text = page(study, count, tmp_path)
     assert text.split("\n\n")[2] == f"All {len(count)} runs of the study have been flown."
     assert re.search(
-        r"\| ranking of systems \| Spearman 1\.00, median of \d+ rankings .* passed \|", text
+        r"\| ranking of systems \| Spearman 1\.00, median of \d+ rankings of 7 systems: passed \|",
+        text,
     )
-    assert re.search(r"\| level \| 1 in the median of \d+ \|.*\| passed \|", text)
+    assert re.search(r"\| level \| 1 in the median of \d+: passed \|", text)
+    assert "Of 7 of the 7 systems that count, over all worlds.\n" in text
+    under = r"nder `{}` 154 runs: 7 systems, 3 sequences, 2 worlds, 5 seeds"
+    assert all(re.search(under.format(name), text) for name in ("real", "steady"))
     assert "| 0.035 / 0.035 |" in text
     assert "no: it was developed with this simulator" in text
     assert re.search(r"\| dso \| × 1 \(\d+\) \| × 1 \(10\) \|", text)
@@ -143,7 +147,9 @@ def test_a_world_that_is_not_counted_is_shown_with_the_reason(study: Study, tmp_
         if run.world == first.name:
             count[run] = changed(result, ate_m=100.0 / (result.ate_m or 1.0), final_ate_m=None)
     text = page(apart, count, tmp_path)
-    by_all = r"\| ranking of systems \| Spearman 1\.00, .* passed \|"
+    by_all = (
+        r"\| ranking of systems \| Spearman 1\.00, median of 3 rankings of 7 systems: passed \|"
+    )
     assert re.search(by_all, text)
     assert not re.search(by_all, page(study, count, tmp_path / "all"))
     assert "over all worlds that count." in text
@@ -152,21 +158,53 @@ def test_a_world_that_is_not_counted_is_shown_with_the_reason(study: Study, tmp_
     assert re.search(r"\| level \| .*: failed \| 1 in the median of \d+: passed \|", text)
 
 
-def test_a_condition_that_is_not_counted_is_shown_with_the_reason(
+def test_each_judged_condition_has_verdicts_and_tables_of_its_own(
     study: Study, tmp_path: Path
 ) -> None:
-    """Nothing agrees under it; what counts does not change, and it has columns and tables."""
+    """Nothing agrees under the second; and where the same systems were flown, both are compared."""
     count = made_up(study)
     for run, result in count.items():
         if run.condition == "steady":
             count[run] = changed(result, ate_m=100.0 / (result.ate_m or 1.0), final_ate_m=None)
+        if run.condition == "steady" and run.system == "dso":
+            count[run] = changed(result, ate_m=0.001, final_ate_m=0.001)
     text = page(study, count, tmp_path)
-    assert re.search(r"\| ranking of systems \| Spearman 1\.00, .* passed \|", text)
-    assert "| criterion | poor | rich | poor, steady | rich, steady |" in text
-    assert re.search(r"\| V1_01 \| poor \| steady \| \d \| -?0\.\d\d \|", text)
-    assert re.search(r"\| V1_01 \| poor \| real \| \d \| 1\.00 \|", text)
-    assert text.count("\n\nUnder `steady`, **reported, not counted**: no camera in a room") == 2
-    assert "| 2500.000 / 0.040 |" in text.split("Under `steady`")[1]
+    assert "| criterion | real | steady | passes | ceiling |" in text
+    assert re.search(r"\| ranking of systems \| [^|]*: passed \| [^|]*: \*\*failed\*\* \|", text)
+    assert "Inverted under `steady`: " in text
+    assert "Inverted under `real`: " not in text
+    assert "| criterion | poor, real | rich, real | poor, steady | rich, steady |" in text
+    assert re.search(r"\| V1_01 \| poor \| steady \| 7 \| -0\.\d\d \|", text)
+    assert re.search(r"\| V1_01 \| poor \| real \| 7 \| 1\.00 \|", text)
+    assert re.search(r"\| V1_01 \| poor \| 7 \| 1\.00 \| -0\.\d\d under `steady` \|", text)
+    assert text.count("\n\nUnder `steady`:\n\n| system |") == 2
+    assert "| 2500.000 / 0.040 |" in text.split("Under `steady`:")[1]
+
+
+def test_rankings_are_compared_where_the_same_systems_were_flown(
+    study: Study, tmp_path: Path
+) -> None:
+    """Of V1_01 under both: DSO, which has the only wrong error, was flown under the first alone."""
+    count = {
+        run: changed(result, final_ate_m=1e-4) if run.system == "dso" else result
+        for run, result in made_up(study).items()
+        if run.condition == "real" or (run.condition == "steady" and run.system != "dso")
+    }
+    text = page(study, count, tmp_path)
+    assert "| V1_01 | poor | 6 | 1.00 | 1.00 under `steady` |" in text
+    assert not re.search(r"\| V1_01 \| poor \| real \| 7 \| 1\.00", text)
+
+
+def test_failures_by_a_system_s_own_median_are_marked(study: Study, tmp_path: Path) -> None:
+    """Six times its own; DSO's published failure is V1_03."""
+    count = made_up(study)
+    for run, result in count.items():
+        if (run.system, run.sequence, run.condition) == ("basalt", "V1_02", "real"):
+            count[run] = changed(result, ate_m=0.6)
+    real, steady = page(study, count, tmp_path).split("## poor:")[1].split("Under `steady`:")[:2]
+    assert "| basalt | 0.040 / 0.040 | 0.600* / 0.050 | 0.100 / 0.100 |" in real
+    assert "| basalt | 0.040 / 0.040 | 0.050 / 0.050 | 0.100 / 0.100 |" in steady
+    assert re.search(r"\| dso \| .* 0\.903\*? / 0\.903\* \|", real)
 
 
 def test_a_condition_is_compared_with_the_one_that_it_names(study: Study, tmp_path: Path) -> None:
@@ -212,9 +250,10 @@ def test_inverted_pairs_are_named(study: Study, tmp_path: Path) -> None:
             count[run] = changed(result, final_ate_m=3.0)
     text = page(study, count, tmp_path)
     assert re.search(
-        r"Inverted:.*openvins errs [\d.]+ × as much as orb_slam3_stereo_inertial", text
+        r"Inverted under `real`: .*openvins errs [\d.]+ × as much as orb_slam3_stereo_inertial",
+        text,
     )
-    assert re.search(r"pairs in the right order \|.* \*\*failed\*\* \|", text)
+    assert re.search(r"pairs in the right order \| [^|]*: \*\*failed\*\* \|", text)
 
 
 def test_the_page_alone_needs_no_truth(tmp_path: Path) -> None:
@@ -222,6 +261,33 @@ def test_the_page_alone_needs_no_truth(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "Nothing of the study" in (tmp_path / "R.md").read_text(encoding="utf-8")
     assert not (tmp_path / "sweeps").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--plan"], "--plan: expected --truth, the folder of the ground truth, found none"),
+        (
+            ["--truth", ".", "--conditions", "half_rate", "--worlds", "poor"],
+            "expected --sequences, --worlds and --conditions that the study flies together",
+        ),
+    ],
+)
+def test_what_plans_no_run_is_refused(words: list[str], message: str, tmp_path: Path) -> None:
+    done = command("reality", *words, "--results", "r.csv", "--page", "R.md", folder=tmp_path)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert not (tmp_path / "R.md").exists()
+
+
+def test_a_row_that_was_not_published_is_refused_before_a_flight(
+    small: Path, tmp_path: Path
+) -> None:
+    small.write_text(small.read_text().replace('"DSO, mono"', '"DSO, monoo"'))
+    words = "--file", small, "--results", "r.csv", "--page", "R.md"
+    done = command("reality", *words, folder=tmp_path)
+    assert done.returncode == 2
+    assert "good: published: expected a row of published.toml, found DSO, monoo" in done.stderr
 
 
 def test_an_interruption_loses_nothing(

@@ -176,9 +176,37 @@ def test_a_row_with_a_word_too_few_is_refused(tmp_path: Path) -> None:
         read_published(tmp_path / "p.toml").errors()
 
 
-def test_a_condition_against_one_that_is_not_there_is_refused(small: Path) -> None:
-    small.write_text(STUDY.replace('name = "sharp"', 'name = "sharp"\nagainst = "raal"'))
-    with pytest.raises(ConfigError, match=r"condition sharp: against: expected one of real, sharp"):
+@pytest.mark.parametrize(
+    ("line", "other", "message"),
+    [
+        (
+            'sequences = ["S1"]',
+            'sequences = ["S3"]',
+            r"sharp: sequences: expected of S1, S2, found S3",
+        ),
+        (
+            'worlds = ["wall"]',
+            'worlds = ["wal"]',
+            r"sharp: worlds: expected of wall, given, found wal",
+        ),
+        (
+            'name = "sharp"',
+            'name = "sharp"\nagainst = "raal"',
+            r"sharp: against: expected of real, sharp, found raal",
+        ),
+        (
+            'name = "sharp"',
+            'name = "real"',
+            r"conditions: expected each name once, found twice real",
+        ),
+        ('name = "S2"', 'name = "S1"', r"sequences: expected each name once, found twice S1"),
+    ],
+)
+def test_a_name_that_is_not_there_or_twice_is_refused(
+    line: str, other: str, message: str, small: Path
+) -> None:
+    small.write_text(STUDY.replace(line, other))
+    with pytest.raises(ConfigError, match=message):
         read_study(small)
 
 
