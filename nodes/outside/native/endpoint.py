@@ -287,7 +287,7 @@ class Endpoint:
                 lambda: program.trajectory or program.gone or self._closed, seconds
             )
             if program.trajectory is None:
-                found = program.end_reason or f"none within its grace of {seconds:.2g} s"
+                found = program.end_reason or f"none in the {seconds:.2g} s left of grace"
                 raise LinkError(f"{program.name}: expected its trajectory, found {found}")
             return program.trajectory
 

@@ -88,7 +88,7 @@ def reality(
     if plan and not truth:
         raise CommandError("--plan: expected --truth, the folder of the ground truth, found none")
     full_study, published = read_study(file) if file else read_study(), read_published()
-    published.by_system(full_study)
+    published.by_system(full_study)  # refuses a row that is not there before a flight
     study = full_study.only(
         sequences=_names(sequences),
         worlds=_names(worlds),
@@ -331,6 +331,8 @@ def write_page(
         errors,
         {name: system.published for name, system in systems.items() if system.published},
         worlds,
+        failed[first],
+        failed_in_reality,
         folder / "scatter.svg",
     )
     flown = [

@@ -11,8 +11,6 @@ from runtime.tools.reality.agreement import (
     Cell,
     Published,
     Simulated,
-    failing,
-    failing_cells,
 )
 
 MARKS = "os^Dv*Xp"
@@ -24,6 +22,8 @@ def draw(
     published: Published,
     labels: Mapping[str, str],
     worlds: Sequence[str],
+    failed: Mapping[str, Mapping[Cell, bool]],
+    failed_in_reality: Mapping[str, Mapping[str, bool]],
     path: Path,
 ) -> bool:
     """Draw each system's errors in each cell, as SVG; return whether there was one.
@@ -31,6 +31,8 @@ def draw(
     Args:
         labels: Label of each system, by its name.
         worlds: In the order of the panels.
+        failed: Whether each system failed in each cell; it is hollow then.
+        failed_in_reality: The same of each sequence.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -52,8 +54,8 @@ def draw(
                 "ls": "",
             }
             at = [min(value, FAILED) for value in (real, sim)]
-            failed = failing_cells(simulated[name])[cell] or failing(published[name])[cell.sequence]
-            axes.plot(*at, **look, fillstyle="none" if failed else "full", clip_on=False)
+            hollow = failed[name][cell] or failed_in_reality[name][cell.sequence]
+            axes.plot(*at, **look, fillstyle="none" if hollow else "full", clip_on=False)
             axes.annotate(cell.sequence, at, fontsize=5, xytext=(3, 2), textcoords="offset points")
             handles[labels[name]] = axes.plot([], [], **look)[0]
         axes.set(xscale="log", yscale="log", xlim=(0.008, 4.0), ylim=(0.002, 4.0), title=world)

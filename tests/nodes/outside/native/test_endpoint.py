@@ -359,7 +359,7 @@ def test_the_trajectory_is_in_the_frame_of_the_poses_before_it(
 @pytest.mark.parametrize(
     ("message", "reason"),
     [
-        (None, r"none within its grace of 0\.05 s"),
+        (None, r"none in the 0\.05 s left of grace"),
         ((5, b"no map"), "it said goodbye no map"),
         ((36, bytes(105)), "TRAJECTORY: expected 104 bytes a pose, found 105 in all"),
     ],
